@@ -1,0 +1,31 @@
+"""No network, one thread, and the tiny pieces most tests start from."""
+
+import os
+
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import pytest
+import torch
+from tiny import tiny_model, write_base, write_raw_tree
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture
+def model():
+    """A fresh tiny Depth Anything, float32, eval."""
+    return tiny_model()
+
+
+@pytest.fixture(scope="session")
+def base_dir(tmp_path_factory):
+    """The tiny model as a transformers folder; read only."""
+    return write_base(tmp_path_factory.mktemp("base"))
+
+
+@pytest.fixture
+def raw_tree(tmp_path):
+    """RAW with two train groups (2 and 3 images) and one validation group (2 images and a reference)."""
+    return write_raw_tree(tmp_path / "raw")

@@ -1,0 +1,198 @@
+"""What a run is told: one dataclass through `transformers.HfArgumentParser`, YAML first, then the command line.
+
+An unknown key in either is an error. The defaults are the paper's settings (section 4, implementation details), the
+names those of the Hugging Face examples.
+"""
+
+import argparse
+import difflib
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Literal
+
+import yaml
+
+# What a run may be resumed with when it differs: everything else changes the weights that come out.
+FREE_TO_CHANGE = {
+    "dataset_name",  # the folder may move: its content is compared by fingerprint
+    "dataset_revision",
+    "proxies_dir",
+    "output_dir",
+    "overwrite_output_dir",
+    "num_train_epochs",  # the learning rate is constant, so a longer run has the shorter one as its beginning
+    "max_steps",
+    "retain",  # gradients do not depend on it, to the bit on CPU
+    "dataloader_num_workers",
+    "group_cache_gb",
+    "checkpointing_steps",
+    "checkpoints_total_limit",
+    "checkpoint_at_steps",
+    "resume_from_checkpoint",
+    "report_to",
+    "license",
+    "push_to_hub",
+    "hub_model_id",
+    "hub_private_repo",
+    "config",
+}
+
+
+def _arg(text: str, default=...):
+    return field(metadata={"help": text}) if default is ... else field(default=default, metadata={"help": text})
+
+
+@dataclass
+class GiftTrainingArguments:
+    """Everything a run is told; `--help` prints the texts below. A value out of range is a ValueError naming it."""
+
+    model_name_or_path: str = _arg("the base model: hub id or folder, loaded in float32")
+    dataset_name: str = _arg("GIFT-I: raw tree, prepared folder, parquet release or hub id")
+    output_dir: str = _arg("where the run goes: adapters, checkpoints, metrics.jsonl, config.yaml")
+    config: str | None = _arg("YAML file with values for these arguments; the command line wins", None)
+    model_revision: str | None = _arg("branch, tag or commit of the base model", None)
+    dataset_revision: str | None = _arg("branch, tag or commit of the dataset", None)
+    proxies_dir: str | None = _arg("folder of the teacher's predictions; default: DATASET/proxies", None)
+    overwrite_output_dir: bool = _arg("delete the run that output_dir holds and start again", False)
+
+    head: Literal["full", "lora", "none"] = _arg(
+        "the depth head: trained in full (the paper), LoRA, or frozen", "full"
+    )
+    lora_rank: int = _arg("rank of the LoRA matrices", 8)
+    target_modules: str | None = _arg("encoder modules that get LoRA (regex), for a model without a recipe", None)
+    modules_to_save: list[str] = field(
+        default_factory=list, metadata={"help": "head modules trained in full, for a model without a recipe"}
+    )
+    prediction_kind: Literal["depth", "inverse_depth"] | None = _arg(
+        "what the model predicts, for a model without a recipe", None
+    )
+    height: int | None = _arg("image height at the network; default: the recipe's (476)", None)
+    width: int | None = _arg("image width at the network; default: the recipe's (644)", None)
+
+    lambda_c: float = _arg("weight of the group consistency, Eq. 6", 1.0)
+    lambda_d: float = _arg("weight of the self-distillation, Eq. 6; 0 collapses the depth", 1.0)
+    micro_batch_size: int = _arg("images per forward; bounds the memory, not the gradient", 2)
+    retain: str = _arg("images whose graphs are kept instead of replayed: 0 (the paper), a number, or auto", "auto")
+    num_train_epochs: int = _arg("passes over the groups, one update per group", 50)
+    max_steps: int = _arg("stop after this many updates; -1: num_train_epochs decides", -1)
+    learning_rate: float = _arg("Adam's learning rate, constant", 2e-5)
+    adam_beta1: float = _arg("Adam's beta1", 0.9)
+    adam_beta2: float = _arg("Adam's beta2", 0.999)
+    adam_epsilon: float = _arg("Adam's epsilon", 1e-8)
+    weight_decay: float = _arg("Adam's weight decay", 0.0)
+    mixed_precision: Literal["no", "bf16", "fp16"] | None = _arg(
+        "autocast; default: accelerate's setting, else bf16 on CUDA and no on CPU; fp16 is refused", None
+    )
+    seed: int = _arg("seed of the LoRA initialisation and of the order of the groups", 0)
+    dataloader_num_workers: int = _arg("threads that decode and resize the next groups", 2)
+    group_cache_gb: float = _arg("memory for groups kept at network size between epochs", 4.0)
+
+    checkpointing_steps: int | None = _arg("a checkpoint every so many updates; default: every epoch", None)
+    checkpoints_total_limit: int | None = _arg("how many of the newest checkpoints are kept", 2)
+    checkpoint_at_steps: list[int] = field(
+        default_factory=list, metadata={"help": "updates after which a checkpoint is written and never deleted"}
+    )
+    resume_from_checkpoint: str | None = _arg(
+        "a checkpoint-<step> folder, or latest: the newest complete one in output_dir", None
+    )
+    report_to: Literal["none", "tensorboard", "trackio"] = _arg("experiment tracker", "none")
+    license: str | None = _arg("licence named in the card; default: the base model's where known", None)
+    push_to_hub: bool = _arg("upload the adapter when training has ended (token: hf auth login)", False)
+    hub_model_id: str | None = _arg("repository for the upload; default: the name of output_dir", None)
+    hub_private_repo: bool = _arg("make that repository private", False)
+
+    def __post_init__(self):
+        if self.mixed_precision == "fp16":
+            raise ValueError("mixed_precision: fp16 would need a loss scaler around the group step; use bf16 or no")
+        if str(self.retain) != "auto":
+            try:
+                self.retain = int(self.retain)
+            except ValueError:
+                raise ValueError(f"retain: expected auto or a number of images, got {self.retain!r}") from None
+        if (self.height is None) != (self.width is None):
+            raise ValueError("height and width: give both or neither")
+        for name in (
+            "lora_rank",
+            "micro_batch_size",
+            "num_train_epochs",
+            "checkpointing_steps",
+            "checkpoints_total_limit",
+        ):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ValueError(f"{name}: must be at least 1, got {value}")
+        for name in ("lambda_c", "lambda_d", "weight_decay", "dataloader_num_workers", "group_cache_gb", "seed"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: must not be negative, got {getattr(self, name)}")
+        if self.retain != "auto" and self.retain < 0:
+            raise ValueError(f"retain: must not be negative, got {self.retain}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate: must be positive, got {self.learning_rate}")
+        if self.max_steps < 1 and self.max_steps != -1:
+            raise ValueError(f"max_steps: must be at least 1, or -1, got {self.max_steps}")
+        if self.overwrite_output_dir and self.resume_from_checkpoint:
+            raise ValueError("overwrite_output_dir and resume_from_checkpoint exclude each other")
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """(height, width) at the network, or None for the recipe's."""
+        return None if self.height is None else (self.height, self.width)
+
+    def to_yaml(self) -> str:
+        """All values as `--config` reads them, without what is None or empty and without the two about resuming."""
+        skip = ("config", "overwrite_output_dir", "resume_from_checkpoint")
+        values = {k: v for k, v in asdict(self).items() if k not in skip and v is not None and v != []}
+        return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
+
+
+def parse_arguments(argv: list[str]) -> GiftTrainingArguments:
+    """`argv` (without the program's name) over the YAML file of `--config` over the defaults.
+
+    Raises ValueError naming the argument: an unknown key (with the nearest known one), a missing one, a wrong type.
+    FileNotFoundError if the YAML file does not exist.
+    """
+    from transformers import HfArgumentParser
+
+    config = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    config.add_argument("--config", type=Path)
+    path = config.parse_known_args(argv)[0].config
+    from_file = [] if path is None else _yaml_to_argv(path)
+    parser = HfArgumentParser(GiftTrainingArguments, prog="gift-peft train", allow_abbrev=False)
+    parser.error = _raise
+    arguments, unknown = parser.parse_args_into_dataclasses(
+        from_file + list(argv), return_remaining_strings=True, look_for_args_file=False
+    )
+    if unknown:
+        raise ValueError(f"unknown argument {unknown[0]}{_nearest(unknown[0].lstrip('-').split('=')[0])}")
+    return arguments
+
+
+def _raise(message: str):
+    raise ValueError(message)
+
+
+def _yaml_to_argv(path: Path) -> list[str]:
+    """The file's keys as if they stood on the command line, so that both are checked by the same parser."""
+    if not path.is_file():
+        raise FileNotFoundError(f"config: no such file: {path}")
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"config {path}: not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"config {path}: expected lines of the form `key: value`")
+    known = {f.name for f in fields(GiftTrainingArguments)} - {"config"}
+    argv = []
+    for key, value in values.items():
+        if key not in known:
+            raise ValueError(f"config {path}: unknown key {key!r}{_nearest(str(key))}")
+        if isinstance(value, dict):
+            raise ValueError(f"config {path}: {key}: expected a value, not a mapping")
+        if isinstance(value, list):
+            argv += [f"--{key}", *map(str, value)] if value else []
+        elif value is not None:
+            argv.append(f"--{key}={value}")
+    return argv
+
+
+def _nearest(name: str) -> str:
+    match = difflib.get_close_matches(name, [f.name for f in fields(GiftTrainingArguments)], n=1)
+    return f"; did you mean {match[0]}?" if match else ""

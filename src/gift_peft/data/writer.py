@@ -1,0 +1,229 @@
+"""Write a prepared GIFT-I folder: the tree that plain `datasets.load_dataset(folder)` reads with no code of ours.
+
+One `metadata.parquet` per split, both with the same explicit schema (ImageFolder refuses splits whose columns differ),
+a readable copy `groups.jsonl`, and a dataset card whose YAML names the files of each split.
+"""
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
+
+from gift_peft.data.preprocess import SURFACES, check_group, image_digest, open_image, to_mask, to_rgb
+
+SPLITS = ("train", "validation")
+NAMES = pa.list_(pa.string())
+SCHEMA = pa.schema(
+    [
+        ("group_id", pa.string()),
+        ("surface", pa.string()),
+        ("image_names", NAMES),
+        ("images_file_names", NAMES),
+        ("masks_file_names", NAMES),
+        ("valids_file_names", NAMES),
+        ("depths_file_names", NAMES),
+        ("reference_file_name", pa.string()),
+    ]
+)
+
+CARD = """---
+license: {license}
+pretty_name: {pretty_name}
+task_categories:
+- depth-estimation
+tags:
+- gift-peft
+configs:
+- config_name: default
+  data_files:
+{data_files}
+---
+# {title}
+
+{description}
+
+{counts}
+
+Each row is a group: images of one camera pose and target geometry, in which what is reflected or seen through the
+target changes. `masks` mark the target in each image, `reference` is the same scene with the target's surface treated,
+`depths` is true z-depth in millimetres (0 = unknown), for evaluation only.
+
+```python
+import datasets
+groups = datasets.load_dataset("path/to/this/folder")  # plain rows
+import gift_peft
+groups = gift_peft.load_gift_i("path/to/this/folder", "train")  # checked rows, with proxies if a teacher is named
+```
+"""
+
+
+def write_gift_i(
+    groups: Iterable[dict],
+    folder: str | Path,
+    *,
+    license: str,
+    pretty_name: str = "GIFT-I",
+    description: str = "Groups for GIFT fine-tuning of monocular depth models.",
+) -> Path:
+    """Write groups as a prepared GIFT-I folder, each one whole or not at all, and return the folder.
+
+    Groups already in the folder stay; one with the same split and id is replaced. Every image is decoded and checked
+    before anything of its group is written.
+
+    Args:
+        groups (`Iterable[dict]`): each with `split` ("train" or "validation"), `group_id` (a file name without
+            separators), `images` (N paths or PIL images), `masks` (N paths, PIL images or (H, W) bool arrays), and
+            optionally `surface` ("mirror", "transparent" or None), `image_names` (N strings; default the files' names),
+            `valids` (like masks, or empty), `depths` (N paths of 16-bit PNGs or (H, W) uint16 arrays in mm, 0 = unknown,
+            or empty) and `reference` (path or PIL image). Image files are copied as they are, PIL images become PNG.
+        folder (`str` or `Path`): made if it does not exist.
+        license (`str`): for the card, for example "cc-by-4.0".
+
+    Raises:
+        ValueError, FileNotFoundError: one line naming the file or group.
+    """
+    folder = Path(folder)
+    rows = {split: _read_rows(folder / split / "metadata.parquet") for split in SPLITS}
+    for group in groups:
+        split = group.get("split")
+        if split not in SPLITS:
+            raise ValueError(f"group {group.get('group_id')}: split {split!r}; write train or validation")
+        row = _write_group(group, folder / split)
+        rows[split][row["group_id"]] = row
+        _write_metadata(folder / split / "metadata.parquet", rows[split].values())
+    lines = [json.dumps({"split": split, **row}) + "\n" for split in SPLITS for row in rows[split].values()]
+    if not lines:
+        raise ValueError(f"no groups to write to {folder}")
+    _replace(folder / "groups.jsonl", "".join(lines).encode())
+    _replace(folder / "README.md", _card(rows, license, pretty_name, description).encode())
+    return folder
+
+
+def _read_rows(path: Path) -> dict[str, dict]:
+    return {row["group_id"]: row for row in pq.read_table(path).to_pylist()} if path.exists() else {}
+
+
+def _write_group(group: dict, folder: Path) -> dict:
+    """Check a group, write its folder beside the final place and rename it there; its metadata row."""
+    group_id = group["group_id"]
+    check_group_id(group_id)
+    surface = group.get("surface")
+    if surface is not None and surface not in SURFACES:
+        raise ValueError(f"group {group_id}: surface {surface!r}; it is one of {', '.join(SURFACES)} or None")
+    names = list(group.get("image_names") or _default_names(group["images"]))
+    label = [f"group {group_id}, image {name}" for name in names]
+    images = [_rgb(image, at) for image, at in zip(group["images"], label, strict=False)]
+    masks = [_mask(mask, f"{at}: its mask") for mask, at in zip(group["masks"], label, strict=False)]
+    valids = [_mask(mask, f"{at}: its valid mask") for mask, at in zip(group.get("valids") or [], label, strict=False)]
+    depths = [_depth(depth, f"{at}: its depth") for depth, at in zip(group.get("depths") or [], label, strict=False)]
+    reference = group.get("reference")
+    reference_image = None if reference is None else _rgb(reference, f"group {group_id}, reference")
+    check_group(group_id, names, images, masks, valids, depths, reference_image, train=group["split"] == "train")
+    least = 1 if group["split"] == "validation" and reference is not None else 2
+    if len({image_digest(image) for image in images}) < max(least, len(images)):
+        raise ValueError(f"group {group_id}: {len(images)} images; it takes at least {least}, all different")
+
+    partial = folder / f".{group_id}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    files = {kind: [] for kind in ("images", "masks", "valids", "depths")}
+    stems = [f"{index:02d}_{re.sub(r'[^A-Za-z0-9_.-]', '_', Path(name).stem)}" for index, name in enumerate(names)]
+    for kind, items in (("images", group["images"]), ("masks", masks), ("valids", valids), ("depths", depths)):
+        for stem, item in zip(stems, items, strict=False):
+            files[kind].append(f"{group_id}/{kind}/{_save(item, partial / kind / stem)}")
+    reference_file = None if reference is None else f"{group_id}/{_save(reference, partial / 'reference')}"
+    shutil.rmtree(folder / group_id, ignore_errors=True)
+    os.replace(partial, folder / group_id)
+    return {
+        "group_id": group_id,
+        "surface": surface,
+        "image_names": names,
+        **{f"{kind}_file_names": paths for kind, paths in files.items()},
+        "reference_file_name": reference_file,
+    }
+
+
+def check_group_id(group_id: str) -> None:
+    """Raise ValueError unless a group's id can name a folder and a proxy file."""
+    if not group_id or group_id.startswith(".") or re.search(r'[/\\:*?"<>|\0]', group_id):
+        raise ValueError(f"group id {group_id!r}: it names a folder, so no separators and no leading dot")
+
+
+def _default_names(images: list) -> list[str]:
+    return [
+        f"{index:02d}.png" if isinstance(image, Image.Image) else Path(image).name for index, image in enumerate(images)
+    ]
+
+
+def _rgb(source, name: str) -> Image.Image:
+    at = name if isinstance(source, Image.Image) else f"{source}"
+    return to_rgb(open_image(source, at), at)
+
+
+def _mask(source, name: str) -> np.ndarray:
+    if isinstance(source, np.ndarray):
+        return to_mask(Image.fromarray(source.astype(np.uint8) if source.dtype == bool else source), name)
+    at = name if isinstance(source, Image.Image) else f"{source}"
+    return to_mask(open_image(source, at), at)
+
+
+def _depth(source, name: str) -> np.ndarray:
+    if not isinstance(source, np.ndarray):
+        image = open_image(source, str(source))
+        if not image.mode.startswith("I"):
+            raise ValueError(f"{source}: mode {image.mode}; depth is a 16-bit PNG in millimetres")
+        source = np.asarray(image)
+    if source.ndim != 2 or not np.issubdtype(source.dtype, np.integer) or source.min() < 0 or source.max() > 65535:
+        raise ValueError(f"{name}: depth is (H, W), whole millimetres from 0 (unknown) to 65535")
+    return source.astype(np.uint16)
+
+
+def _save(item, stem: Path) -> str:
+    """Write one picture under `stem` and return its file name: files are copied, everything else becomes PNG."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(item, str | Path):
+        target = stem.with_name(stem.name + Path(item).suffix.lower())
+        shutil.copyfile(item, target)
+        return target.name
+    target = stem.with_name(stem.name + ".png")
+    if isinstance(item, np.ndarray):
+        item = Image.fromarray(item.astype(np.uint8) * 255 if item.dtype == bool else item)
+    else:
+        item = _rgb(item, stem.name)
+    item.save(target)
+    return target.name
+
+
+def _write_metadata(path: Path, rows: Iterable[dict]) -> None:
+    sink = pa.BufferOutputStream()
+    pq.write_table(pa.Table.from_pylist(list(rows), schema=SCHEMA), sink)
+    _replace(path, sink.getvalue().to_pybytes())
+
+
+def _replace(path: Path, content: bytes) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_bytes(content)
+    os.replace(partial, path)
+
+
+def _card(rows: dict[str, dict], license: str, pretty_name: str, description: str) -> str:
+    present = [split for split in SPLITS if rows[split]]
+    counts = [f"{split}: {len(rows[split])} groups, {_count_images(rows[split])} images" for split in present]
+    return CARD.format(
+        license=license,
+        pretty_name=json.dumps(pretty_name),
+        title=pretty_name,
+        description=description,
+        counts="; ".join(counts) + ".",
+        data_files="\n".join(f"  - split: {split}\n    path: {split}/**" for split in present),
+    )
+
+
+def _count_images(rows: dict[str, dict]) -> int:
+    return sum(len(row["image_names"]) for row in rows.values())

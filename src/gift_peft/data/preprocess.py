@@ -8,7 +8,6 @@ nearest neighbour, which samples the same pixel centres.
 import hashlib
 import io
 import math
-import os
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -113,7 +112,9 @@ def to_mask(image: Image.Image, name: str, target_class: int | Sequence[int] | N
         return np.isin(values, target_class)
     if values.dtype == bool:
         return values
-    levels = np.flatnonzero(np.bincount(values.ravel(), minlength=2)) if values.dtype == np.uint8 else np.unique(values)
+    levels = (
+        np.flatnonzero(np.bincount(values.ravel(), minlength=2)) if values.dtype == np.uint8 else np.unique(values)
+    )
     if len(levels) > 2:
         raise ValueError(
             f"{name}: {len(levels)} different values ({', '.join(map(str, levels[:4]))}, ...); a mask has at most two, "
@@ -259,7 +260,9 @@ def collate_group(row: dict, processor, size: tuple[int, int]) -> Group:
     label = [f"group {group_id}, image {name}" for name in names]
     images = [to_rgb(image, at) for image, at in zip(row["images"], label, strict=False)]
     masks = [to_mask(mask, f"{at}: its mask") for mask, at in zip(row["masks"], label, strict=False)]
-    valids = [to_mask(valid, f"{at}: its valid mask") for valid, at in zip(row.get("valids") or [], label, strict=False)]
+    valids = [
+        to_mask(valid, f"{at}: its valid mask") for valid, at in zip(row.get("valids") or [], label, strict=False)
+    ]
     depths = [np.asarray(depth) for depth in row.get("depths") or []]
     reference = row.get("reference")
     reference = None if reference is None else to_rgb(reference, f"group {group_id}, reference")
@@ -294,9 +297,3 @@ def _sized_proxies(proxies, size: tuple[int, int], group_id: str) -> torch.Tenso
             f"make them again with `gift-peft proxies --size {size[0]}x{size[1]} --overwrite`"
         )
     return proxies
-
-
-def is_image_file(path: Path) -> bool:
-    """Whether a folder entry counts as a picture: a known suffix, not hidden."""
-    suffixes = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm"}
-    return path.suffix.lower() in suffixes and not path.name.startswith(".") and os.path.isfile(path)

@@ -157,7 +157,8 @@ def check_group_id(group_id: str) -> None:
 
 def _default_names(images: list) -> list[str]:
     return [
-        f"{index:02d}.png" if isinstance(image, Image.Image) else Path(image).name for index, image in enumerate(images)
+        f"{index:02d}.png" if isinstance(image, Image.Image) else Path(image).name
+        for index, image in enumerate(images)
     ]
 
 

@@ -1,0 +1,289 @@
+"""GIFT-I as `datasets` rows, one per group, from any of its forms: raw tree, prepared folder, parquet, or hub id.
+
+`load_gift_i` reads them all and attaches proxies; `GiftI` is the builder of the raw tree, so that after
+`import gift_peft` also `datasets.load_dataset("gift_i", data_dir=RAW)` works (paper section 5, the GIFT-I dataset).
+"""
+
+import hashlib
+import inspect
+import os
+import re
+import shlex
+import sys
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import datasets
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from datasets import ClassLabel, Features, List, Value
+from datasets import Image as ImageFeature
+from datasets.builder import Key
+
+from gift_peft.data.preprocess import SURFACES, image_digest, to_mask
+from gift_peft.data.proxies import FORMAT, ProxyStore, default_proxies_dir, teacher_id, teacher_revision
+from gift_peft.data.raw import SPLITS, check_count, list_groups, natural_key, raw_example
+from gift_peft.data.rows import FORMAT_TYPE, IMAGE_COLUMNS
+from gift_peft.data.writer import check_group_id
+
+FEATURES = Features(
+    {
+        "group_id": Value("string"),
+        "surface": ClassLabel(names=SURFACES),
+        "image_names": List(Value("string")),
+        "images": List(ImageFeature()),
+        "masks": List(ImageFeature(mode="L")),
+        "valids": List(ImageFeature(mode="L")),
+        "depths": List(ImageFeature(mode="I;16")),
+        "reference": ImageFeature(),
+    }
+)
+
+
+# ---- the builder of the raw tree ----
+
+
+@dataclass
+class GiftIConfig(datasets.BuilderConfig):
+    """Adds the tree's listing (names, sizes, times) to the cache key: a changed folder is read again.
+
+    `datasets` keys the cache by the files it guesses from split words in path names, which may be some or none.
+    """
+
+    def create_config_id(self, config_kwargs: dict, custom_features=None) -> str:
+        config_id = super().create_config_id(config_kwargs, custom_features)
+        return f"{config_id}-{_listing_digest(self.data_dir)}" if self.data_dir else config_id
+
+
+class GiftI(datasets.GeneratorBasedBuilder):
+    """Reads `RAW[/train|/validation]/<group>/` as it is; rows hold paths, no image is copied."""
+
+    VERSION = datasets.Version("1.0.0")
+    BUILDER_CONFIG_CLASS = GiftIConfig
+    DEFAULT_WRITER_BATCH_SIZE = 8  # embedded, 8 groups of 55 images stay far below arrow's 2 GiB offsets
+
+    def _info(self):
+        return datasets.DatasetInfo(description=__doc__, features=FEATURES)
+
+    def _split_generators(self, dl_manager):
+        # `config.data_files` holds splits that `datasets` guessed from words in path names; the tree itself says it.
+        if not self.config.data_dir:
+            raise ValueError('GIFT-I needs its folder: load_dataset("gift_i", data_dir="path/to/RAW")')
+        return [
+            datasets.SplitGenerator(
+                name=split, gen_kwargs={"groups": [str(group) for group in groups], "split": split}
+            )
+            for split, groups in list_groups(self.config.data_dir).items()
+        ]
+
+    def _generate_shards(self, groups, split):
+        yield from groups
+
+    def _generate_examples(self, groups, split):
+        for shard, folder in enumerate(groups):
+            yield Key(shard, 0), raw_example(Path(folder), split)
+
+
+def register() -> None:
+    """Make `datasets.load_dataset("gift_i", data_dir=RAW)` work; `import gift_peft` calls it. Idempotent.
+
+    Touches one private dictionary of `datasets`, which has no public way since loading scripts were removed.
+    """
+    from datasets import packaged_modules
+
+    from gift_peft.data import preprocess, raw
+
+    # The hash names the cache: of everything that decides what a raw tree becomes.
+    lines = [line for module in (sys.modules[__name__], raw, preprocess) for line in _source_lines(module)]
+    packaged_modules._PACKAGED_DATASETS_MODULES["gift_i"] = (__name__, packaged_modules._hash_python_lines(lines))
+
+
+def _source_lines(module) -> list[str]:
+    return inspect.getsource(module).splitlines()
+
+
+def _listing_digest(folder: str) -> str:
+    digest = hashlib.sha256()
+    for root, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if name != "proxies" and not name.startswith("."))
+        for name in sorted(files):
+            stat = os.stat(os.path.join(root, name))
+            digest.update(f"{os.path.relpath(root, folder)}/{name} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+# ---- loading ----
+
+
+def load_gift_i(
+    path: str | Path,
+    split: str,
+    teacher: str | Path | None = None,
+    proxies_dir: str | Path | None = None,
+    revision: str | None = None,
+    size: tuple[int, int] | None = None,
+) -> datasets.Dataset:
+    """GIFT-I groups, checked, as a `datasets.Dataset` with `FEATURES`; with a teacher also their proxies.
+
+    Groups stay in the dataset's order, images come in natural order, images listed twice are dropped. Rows are decoded
+    when accessed, upright and 8-bit RGB. With `teacher`, accessed rows also have `proxies` (N, h, w) and
+    `reference_proxy` (h, w) or None, float32 tensors, read from their own file and checked against the teacher's
+    weights and the decoded images. The dataset can be sliced, shuffled, selected and given to a DataLoader; proxies stay.
+
+    Args:
+        path (`str` or `Path`): a prepared folder, a raw tree, a folder of parquet files, or a hub dataset id.
+        split (`str`): "train" or "validation", slices such as "train[:10]" included.
+        teacher (`str` or `Path`, *optional*): the base model whose proxies to attach, a hub id or a folder.
+        proxies_dir (`str` or `Path`, *optional*): where `gift-peft proxies` wrote them; default as it has it, the
+            dataset's own `proxies` folder (see `default_proxies_dir`).
+        revision (`str`, *optional*): of the teacher.
+        size (`tuple[int, int]`, *optional*): (h, w) that the proxies must have.
+
+    Raises:
+        FileNotFoundError, ValueError: one line that names the file or group and says what to do.
+    """
+    dataset = _load_rows(path, split)
+    name = re.match(r"\w*", str(split)).group()
+    dataset = _check_rows(dataset, name, path)
+    store = None
+    if teacher is not None:
+        identity = teacher_id(teacher, revision)
+        proxies = Path(proxies_dir) if proxies_dir else default_proxies_dir(path, identity)
+        expected = {"format": FORMAT, "teacher": identity, "revision": teacher_revision(teacher, revision)}
+        if size is not None:
+            expected["size"] = f"{size[0]}x{size[1]}"
+        command = proxies_command(teacher, path, expected.get("size"), proxies_dir, revision)
+        store = ProxyStore(str(proxies / identity / name), expected, command)
+    return dataset.with_format(FORMAT_TYPE, train=name == "train", proxies=store)
+
+
+def proxies_command(teacher, path, size=None, proxies_dir=None, revision=None) -> str:
+    """The shell command that makes these proxies."""
+    options = {
+        "--base": teacher,
+        "--dataset": path,
+        "--size": size,
+        "--proxies_dir": proxies_dir,
+        "--revision": revision,
+    }
+    given = [part for option, value in options.items() if value is not None for part in (option, str(value))]
+    return shlex.join(["gift-peft", "proxies", *given])
+
+
+def _load_rows(path: str | Path, split: str) -> datasets.Dataset:
+    """Rows whose images are still paths or bytes, under FEATURES."""
+    folder = Path(path)
+    if "+" in str(split):
+        raise ValueError(f"split {split!r}: load one split at a time")
+    try:
+        if not folder.is_dir():
+            if not re.fullmatch(r"[\w.-]+(/[\w.-]+)?", str(path)) or folder.exists():
+                raise FileNotFoundError(f"dataset {path}: no such folder")
+            return datasets.load_dataset(str(path), split=split, features=FEATURES)
+        prepared = [name for name in SPLITS if any((folder / name).glob("metadata.*"))]
+        if prepared:
+            # Named here, not left to the card: without one, `datasets` guesses splits from words in path names.
+            files = {name: f"{name}/**" for name in prepared}
+            _check_split(split, prepared, path)
+            return datasets.load_dataset(
+                "imagefolder", data_dir=str(folder), data_files=files, split=split, features=FEATURES
+            )
+        if any(folder.glob("*.parquet")) or any(folder.glob("*/*.parquet")):
+            return datasets.load_dataset(str(folder), split=split, features=FEATURES)
+        _check_split(split, list_groups(folder), path)
+        builder = GiftI(data_dir=str(folder))
+        builder.download_and_prepare()
+        return builder.as_dataset(split=split)
+    except datasets.exceptions.DatasetGenerationError as error:
+        cause = error.__cause__
+        raise (cause if isinstance(cause, ValueError | FileNotFoundError) else error) from None
+
+
+def _check_split(split: str, present, path) -> None:
+    if re.match(r"\w*", str(split)).group() not in present:
+        raise ValueError(f"dataset {path}: no split {split!r}, only {', '.join(present)}")
+
+
+def _check_rows(dataset: datasets.Dataset, split: str, path) -> datasets.Dataset:
+    """Check all that needs no decoding; the dataset with images in natural order and none listed twice."""
+    counts = Counter(dataset["group_id"])
+    for group_id, count in counts.items():
+        check_group_id(group_id)
+        if count > 1:
+            raise ValueError(f"dataset {path}: {count} groups are called {group_id!r} in split {split}")
+    tables = dataset.with_format("arrow")
+    keep = [_check_row(tables[index], split) for index in range(len(dataset))]
+    if all(order == list(range(count)) for order, count in keep):
+        return dataset
+    stored = dataset.cast(_undecoded(dataset.features))
+    columns = ("image_names", *IMAGE_COLUMNS)
+    return stored.map(
+        lambda row, index: {key: [row[key][k] for k in keep[index][0]] for key in columns if row[key]},
+        with_indices=True,
+        features=stored.features,
+    ).cast(dataset.features)
+
+
+def _check_row(table: pa.Table, split: str) -> tuple[list[int], int]:
+    """Of one row: the images to keep, in natural order, and how many there are. Reads no image bytes unless it must."""
+    group_id, names = table["group_id"][0].as_py(), table["image_names"][0].as_py()
+    for column in IMAGE_COLUMNS:
+        files = table[column][0].values
+        count = 0 if files is None else len(files)
+        if count != len(names) and (count or column in ("images", "masks")):
+            raise ValueError(f"group {group_id}: {len(names)} image names, but a list of {count} {column}")
+        for file in [] if files is None else files.field("path").filter(files.field("bytes").is_null()).to_pylist():
+            if "://" not in file and not os.path.exists(file):
+                raise FileNotFoundError(f"group {group_id}: missing {column.removesuffix('s')} {file}")
+    contents = _contents(table["images"][0].values)
+    order = sorted(range(len(names)), key=lambda index: natural_key(names[index]))
+    first = {}
+    for index in order:
+        first.setdefault(contents[index], index)
+    check_count(group_id, len(first), split, table["reference"][0].is_valid)
+    return list(first.values()), len(names)
+
+
+def _contents(images: pa.StructArray) -> list:
+    """Something equal for equal files: a digest where sizes collide, else just the position."""
+    paths = images.field("path").to_pylist()
+    lengths = pc.binary_length(images.field("bytes")).to_pylist()
+    sizes = [
+        length if length is not None else path if "://" in path else os.path.getsize(path)
+        for path, length in zip(paths, lengths, strict=True)
+    ]
+    counts = Counter(sizes)
+    contents = []
+    for index, size in enumerate(sizes):
+        if counts[size] == 1 or isinstance(size, str):
+            contents.append(size if isinstance(size, str) else index)
+        else:
+            content = images.field("bytes")[index].as_py() or Path(paths[index]).read_bytes()
+            contents.append(hashlib.sha256(content).digest())
+    return contents
+
+
+def _undecoded(features: Features) -> Features:
+    plain = ImageFeature(decode=False)
+    return Features({**features, **dict.fromkeys(IMAGE_COLUMNS, List(plain)), "reference": plain})
+
+
+def dataset_fingerprint(dataset: datasets.Dataset) -> str:
+    """32 hex digits of what a dataset holds: every group's names, image contents, masks and reference.
+
+    The same for raw tree, prepared folder and parquet of the same groups, and for any order of the groups.
+    """
+    groups = []
+    for row in dataset.with_format(FORMAT_TYPE):
+        digest = hashlib.sha256(row["group_id"].encode())
+        for name, image, mask in zip(row["image_names"], row["images"], row["masks"], strict=True):
+            digest.update(f"\n{name} {image_digest(image)} ".encode())
+            digest.update(np.packbits(to_mask(mask, f"group {row['group_id']}, image {name}: its mask")).tobytes())
+        for valid in row["valids"]:
+            digest.update(np.packbits(to_mask(valid, f"group {row['group_id']}: a valid mask")).tobytes())
+        if row["reference"] is not None:
+            digest.update(image_digest(row["reference"]).encode())
+        groups.append(digest.hexdigest())
+    return hashlib.sha256("\n".join(sorted(groups)).encode()).hexdigest()[:32]

@@ -1,0 +1,180 @@
+"""Proxy files: what the frozen teacher predicts for a group, and everything needed to know that it still holds.
+
+`proxies/<teacher>/<split>/<group_id>.safetensors` holds `proxies` (N, h, w) float32 in image order and, where the group
+has a treated reference, `reference` (h, w). The header names the teacher, its revision, the size, the image processor's
+settings and a digest of every image's decoded content, so a proxy of other weights or other pixels is never used.
+"""
+
+import functools
+import hashlib
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import safetensors
+import safetensors.torch
+import torch
+
+FORMAT = "gift-peft proxies 1"
+
+
+def teacher_id(base: str | Path, revision: str | None = None) -> str:
+    """The teacher's folder name under `proxies/`: `owner--name[@revision]` for a hub id, the folder's name for a path."""
+    name = Path(base).resolve().name if Path(base).is_dir() else str(base).replace("/", "--")
+    name = re.sub(r"[^A-Za-z0-9._@-]", "_", name + (f"@{revision}" if revision else ""))
+    if name.strip(".") == "":
+        raise ValueError(f"base model {str(base)!r}: neither a folder nor a hub id")
+    return name
+
+
+def teacher_revision(base: str | Path, revision: str | None = None) -> str:
+    """What pins the teacher's weights: the hub commit, or a digest of a local folder's configuration and weights.
+
+    Raises FileNotFoundError if the model is neither a folder nor on the hub (or in its local cache).
+    """
+    if Path(base).is_dir():
+        files = [Path(base) / name for name in ("config.json", "preprocessor_config.json")]
+        files += sorted(path for path in Path(base).iterdir() if path.suffix in (".safetensors", ".bin"))
+        files = [path for path in files if path.exists()]
+        if not any(path.name == "config.json" for path in files):
+            raise FileNotFoundError(f"base model {base}: the folder has no config.json")
+        stats = tuple((str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files)
+        return f"sha256:{_digest_files(stats)}"
+
+    from transformers.utils import cached_file
+    from transformers.utils.hub import extract_commit_hash
+
+    try:
+        config = cached_file(str(base), "config.json", revision=revision)
+    except OSError as error:
+        raise FileNotFoundError(f"base model {base}: {str(error).splitlines()[0]}") from None
+    return extract_commit_hash(config, None) or "unknown"
+
+
+@functools.lru_cache(maxsize=16)
+def _digest_files(stats: tuple[tuple[str, int, int], ...]) -> str:
+    """Of names and contents; sizes and times are in the key so that a changed file is read again."""
+    digest = hashlib.sha256()
+    for path, size, _ in stats:
+        digest.update(f"{Path(path).name} {size} ".encode())
+        with open(path, "rb") as file:
+            while block := file.read(1 << 22):
+                digest.update(block)
+    return digest.hexdigest()[:32]
+
+
+def default_proxies_dir(dataset: str | Path, teacher: str) -> Path:
+    """Where a dataset's proxies are unless told: `<folder>/proxies`, or the cache for what cannot be written.
+
+    A folder that cannot be written and brings no proxies of this teacher, and a hub id, use
+    `$HF_HOME/gift-peft/proxies/<dataset>`.
+    """
+    folder = Path(dataset)
+    if folder.is_dir() and (os.access(folder, os.W_OK) or (folder / "proxies" / teacher).is_dir()):
+        return folder / "proxies"
+    from huggingface_hub.constants import HF_HOME
+
+    slug = str(dataset).replace("/", "--")
+    if folder.is_dir():
+        resolved = str(folder.resolve())
+        slug = f"{folder.resolve().name}-{hashlib.sha256(resolved.encode()).hexdigest()[:12]}"
+    return Path(HF_HOME) / "gift-peft" / "proxies" / slug
+
+
+def write_proxies(path: Path, header: dict[str, str], proxies: torch.Tensor, reference: torch.Tensor | None) -> None:
+    """Write one file, whole or not at all. Leftovers of a killed attempt on the same group are removed."""
+    tensors = {"proxies": proxies.float().contiguous()}
+    if reference is not None:
+        tensors["reference"] = reference.float().contiguous()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial")
+    with open(partial, "wb") as file:
+        file.write(safetensors.torch.save(tensors, metadata=header))
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+    for leftover in path.parent.glob(f".{path.stem}.*.partial"):
+        leftover.unlink(missing_ok=True)
+
+
+def make_header(
+    teacher: str, revision: str, size: tuple[int, int], settings: dict, images: Sequence[str], reference: str
+):
+    """The metadata of a proxy file (safetensors: strings only). `images` and `reference` are digests."""
+    return {
+        "format": FORMAT,
+        "teacher": teacher,
+        "revision": revision,
+        "size": f"{size[0]}x{size[1]}",
+        "processor": json.dumps(settings, sort_keys=True),
+        "images": json.dumps(list(images)),
+        "reference": reference,
+    }
+
+
+def read_header(path: Path) -> dict[str, str]:
+    """The header of a proxy file; ValueError if the file is damaged."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            return file.metadata() or {}
+    except safetensors.SafetensorError as error:
+        raise ValueError(f"damaged proxy file {path} ({str(error).splitlines()[0]})") from None
+
+
+def difference(header: dict[str, str], expected: dict[str, str], names: Sequence[str]) -> str | None:
+    """In words, the first way in which a proxy's header is not the expected one (keys not expected are not compared)."""
+    for key in ("format", "teacher", "revision", "size", "processor"):
+        if key in expected and header.get(key) != expected[key]:
+            what = {"revision": "model or revision", "processor": "image processor"}.get(key, key)
+            return f"it was made with {what} {header.get(key)}, not {expected[key]}"
+    made, now = json.loads(header.get("images", "[]")), json.loads(expected["images"])
+    if len(made) != len(now):
+        return f"it was made for {len(made)} images, and the group has {len(now)}"
+    for name, before, after in zip(names, made, now, strict=True):
+        if before != after:
+            return f"image {name} has changed since"
+    if header.get("reference") != expected["reference"]:
+        return "the treated reference has changed since"
+    return None
+
+
+@dataclass(frozen=True)
+class ProxyStore:
+    """The proxies of one split and teacher; reads one group at a time and checks it before handing it out.
+
+    Args:
+        folder (`str`): `proxies/<teacher>/<split>`.
+        expected (`dict[str, str]`): header entries known beforehand: format, teacher, revision and perhaps size.
+        command (`str`): the shell command that makes these proxies, for messages.
+    """
+
+    folder: str
+    expected: dict[str, str]
+    command: str
+
+    def path(self, group_id: str) -> Path:
+        return Path(self.folder) / f"{group_id}.safetensors"
+
+    def read(self, group_id: str, names: Sequence[str], images: Sequence[str], reference: str):
+        """(proxies (N, h, w), reference (h, w) or None), both float32; digests as in `make_header`.
+
+        Raises FileNotFoundError for a missing file and ValueError for a stale, damaged or NaN one, naming it and the
+        command that makes it again.
+        """
+        path = self.path(group_id)
+        if not path.exists():
+            raise FileNotFoundError(f"missing proxy {path}; make it with `{self.command}`")
+        expected = {**self.expected, "images": json.dumps(list(images)), "reference": reference}
+        reason = difference(read_header(path), expected, names)
+        if reason:
+            raise ValueError(f"stale proxy {path}: {reason}; make it again with `{self.command} --overwrite`")
+        tensors = safetensors.torch.load_file(path)
+        for name, proxy in [*zip(names, tensors["proxies"], strict=True), ("reference", tensors.get("reference"))]:
+            if proxy is not None and not torch.isfinite(proxy).all():
+                raise ValueError(
+                    f"NaN or infinite values in proxy {path} ({name}); make it again with `{self.command} --overwrite`"
+                )
+        return tensors["proxies"], tensors.get("reference")

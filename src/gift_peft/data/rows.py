@@ -1,0 +1,91 @@
+"""What a row of `load_gift_i` looks like when it is read: decoded by our image rules, checked, with its proxies.
+
+A `datasets` formatter, not a wrapper: the result stays a plain `Dataset` (select, shuffle, slices, pickling, DataLoader
+workers), only the rows that are accessed are decoded, and a damaged file is an error that names it, which the decoding
+of the `Image` feature alone does not give.
+"""
+
+import numpy as np
+import pyarrow as pa
+from datasets import formatting
+from datasets.formatting.formatting import Formatter
+from PIL import Image
+
+from gift_peft.data.preprocess import check_group, image_digest, open_image, to_mask, to_rgb
+from gift_peft.data.proxies import ProxyStore
+
+FORMAT_TYPE = "gift_i"
+IMAGE_COLUMNS = ("images", "masks", "valids", "depths")
+
+
+class GiftIFormatter(Formatter):
+    """Rows of GIFT-I. `train` asks for a target in some mask; `proxies` attaches `proxies` and `reference_proxy`."""
+
+    def __init__(self, train: bool = False, proxies: ProxyStore | None = None, features=None, token_per_repo_id=None):
+        super().__init__(features=features, token_per_repo_id=token_per_repo_id)
+        self.train = train
+        self.proxies = proxies
+
+    def format_row(self, pa_table: pa.Table) -> dict:
+        return self._row(self.python_arrow_extractor().extract_row(pa_table))
+
+    def format_batch(self, pa_table: pa.Table) -> dict[str, list]:
+        rows = [self._row(row) for row in pa_table.to_pylist()]
+        return {key: [row[key] for row in rows] for key in (rows[0] if rows else pa_table.column_names)}
+
+    def format_column(self, pa_table: pa.Table) -> list:
+        return self.format_batch(pa_table)[pa_table.column_names[0]]
+
+    def _row(self, stored: dict) -> dict:
+        pictures = {key: stored[key] for key in (*IMAGE_COLUMNS, "reference") if key in stored}
+        row = {key: value for key, value in stored.items() if key not in pictures}
+        row = self.python_features_decoder.decode_row(row) if row else row
+        at = f"group {stored.get('group_id', '?')}"
+        for key, value in pictures.items():
+            if key == "reference":
+                row[key] = None if value is None else to_rgb(*_open(value, f"{at}, reference"))
+            else:
+                row[key] = [self._picture(key, item, at) for item in value or []]
+        if pictures.keys() == {*IMAGE_COLUMNS, "reference"} and {"group_id", "image_names"} <= row.keys():
+            self._check(row)
+            if self.proxies is not None:
+                row["proxies"], row["reference_proxy"] = self._read_proxies(row)
+        return {key: row[key] for key in [*stored, *(key for key in row if key not in stored)]}
+
+    def _picture(self, column: str, item: dict, at: str) -> Image.Image:
+        image, name = _open(item, f"{at}, one of its {column}")
+        if column == "images":
+            return to_rgb(image, name)
+        if column == "depths":
+            if not image.mode.startswith("I"):
+                raise ValueError(f"{name}: mode {image.mode}; depth is a 16-bit PNG in millimetres")
+            return image
+        # Other modes (palette, 16 bit) would change their values in a conversion to L: take the mask, write it as one.
+        return image if image.mode == "L" else Image.fromarray(to_mask(image, name).astype(np.uint8) * 255)
+
+    def _check(self, row: dict) -> None:
+        group_id, names = row["group_id"], row["image_names"]
+        label = f"group {group_id}, a mask"
+        masks = [to_mask(mask, label) for mask in row["masks"]]
+        valids = [to_mask(mask, label) for mask in row["valids"]]
+        depths = [np.asarray(depth) for depth in row["depths"]]
+        check_group(group_id, names, row["images"], masks, valids, depths, row["reference"], train=self.train)
+
+    def _read_proxies(self, row: dict):
+        images = [image_digest(image) for image in row["images"]]
+        reference = "" if row["reference"] is None else image_digest(row["reference"])
+        return self.proxies.read(row["group_id"], row["image_names"], images, reference)
+
+
+def _open(item: dict, fallback: str) -> tuple[Image.Image, str]:
+    """The decoded image of a stored {"bytes", "path"} and the name to give it in messages."""
+    name = fallback if item["bytes"] is not None else item["path"]
+    if item["bytes"] is None and "://" in item["path"]:
+        from datasets.utils.file_utils import xopen
+
+        with xopen(item["path"], "rb") as file:
+            return open_image(file.read(), name), name
+    return open_image(item["path"] if item["bytes"] is None else item["bytes"], name), name
+
+
+formatting._register_formatter(GiftIFormatter, FORMAT_TYPE)

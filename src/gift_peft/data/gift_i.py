@@ -130,7 +130,7 @@ def load_gift_i(
     Groups stay in the dataset's order, images come in natural order, images listed twice are dropped. Rows are decoded
     when accessed, upright and 8-bit RGB. With `teacher`, accessed rows also have `proxies` (N, h, w) and
     `reference_proxy` (h, w) or None, float32 tensors, read from their own file and checked against the teacher's
-    weights and the decoded images. The dataset can be sliced, shuffled, selected and given to a DataLoader; proxies stay.
+    weights and the decoded images. Proxies stay when the dataset is sliced, shuffled, selected or given to a DataLoader.
 
     Args:
         path (`str` or `Path`): a prepared folder, a raw tree, a folder of parquet files, or a hub dataset id.
@@ -227,7 +227,7 @@ def _check_rows(dataset: datasets.Dataset, split: str, path) -> datasets.Dataset
 
 
 def _check_row(table: pa.Table, split: str) -> tuple[list[int], int]:
-    """Of one row: the images to keep, in natural order, and how many there are. Reads no image bytes unless it must."""
+    """Of one row: the images to keep, in natural order, and how many there are."""
     group_id, names = table["group_id"][0].as_py(), table["image_names"][0].as_py()
     for column in IMAGE_COLUMNS:
         files = table[column][0].values

@@ -80,7 +80,7 @@ def open_image(source: str | Path | bytes | Image.Image, name: str | None = None
 
 
 def to_rgb(image: Image.Image, name: str) -> Image.Image:
-    """8-bit RGB from RGB, grey, palette and opaque RGBA; real transparency, 16-bit, CMYK and others raise ValueError."""
+    """8-bit RGB from RGB, grey, palette and opaque RGBA; transparency, 16-bit, CMYK and others raise ValueError."""
     if image.mode == "RGB" and "transparency" not in image.info:
         return image
     if image.has_transparency_data:
@@ -117,8 +117,8 @@ def to_mask(image: Image.Image, name: str, target_class: int | Sequence[int] | N
     )
     if len(levels) > 2:
         raise ValueError(
-            f"{name}: {len(levels)} different values ({', '.join(map(str, levels[:4]))}, ...); a mask has at most two, "
-            "or name the target's value in group.yaml (`mask_class: 2`)"
+            f"{name}: {len(levels)} different values ({', '.join(map(str, levels[:4]))}, ...); a mask has at most "
+            "two, or name the target's value in group.yaml (`mask_class: 2`)"
         )
     return values > 0 if values.max(initial=0) <= 1 else values >= 128
 

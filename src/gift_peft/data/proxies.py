@@ -1,8 +1,8 @@
 """Proxy files: what the frozen teacher predicts for a group, and everything needed to know that it still holds.
 
-`proxies/<teacher>/<split>/<group_id>.safetensors` holds `proxies` (N, h, w) float32 in image order and, where the group
-has a treated reference, `reference` (h, w). The header names the teacher, its revision, the size, the image processor's
-settings and a digest of every image's decoded content, so a proxy of other weights or other pixels is never used.
+`proxies/<teacher>/<split>/<group_id>.safetensors` holds `proxies` (N, h, w) float32 in image order and, where the
+group has a treated reference, `reference` (h, w). The header names the teacher, its revision, the size, the image
+processor's settings and a digest of every image's decoded content: a proxy of other weights or pixels is never used.
 """
 
 import functools
@@ -22,7 +22,7 @@ FORMAT = "gift-peft proxies 1"
 
 
 def teacher_id(base: str | Path, revision: str | None = None) -> str:
-    """The teacher's folder name under `proxies/`: `owner--name[@revision]` for a hub id, the folder's name for a path."""
+    """The teacher's folder under `proxies/`: `owner--name[@revision]` for a hub id, the folder's name for a path."""
     name = Path(base).resolve().name if Path(base).is_dir() else str(base).replace("/", "--")
     name = re.sub(r"[^A-Za-z0-9._@-]", "_", name + (f"@{revision}" if revision else ""))
     if name.strip(".") == "":
@@ -125,7 +125,7 @@ def read_header(path: Path) -> dict[str, str]:
 
 
 def difference(header: dict[str, str], expected: dict[str, str], names: Sequence[str]) -> str | None:
-    """In words, the first way in which a proxy's header is not the expected one (keys not expected are not compared)."""
+    """In words, the first way in which a proxy's header is not the expected one; None if it is."""
     for key in ("format", "teacher", "revision", "size", "processor"):
         if key in expected and header.get(key) != expected[key]:
             what = {"revision": "model or revision", "processor": "image processor"}.get(key, key)

@@ -1,8 +1,8 @@
 """What a row of `load_gift_i` looks like when it is read: decoded by our image rules, checked, with its proxies.
 
-A `datasets` formatter, not a wrapper: the result stays a plain `Dataset` (select, shuffle, slices, pickling, DataLoader
-workers), only the rows that are accessed are decoded, and a damaged file is an error that names it, which the decoding
-of the `Image` feature alone does not give.
+A `datasets` formatter, not a wrapper: the result stays a plain `Dataset` (select, shuffle, slices, pickling,
+DataLoader workers), only the rows that are accessed are decoded, and a damaged file is an error that names it, which
+the decoding of the `Image` feature alone does not give.
 """
 
 import numpy as np

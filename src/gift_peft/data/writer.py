@@ -80,9 +80,9 @@ def write_gift_i(
     Args:
         groups (`Iterable[dict]`): each with `split` ("train" or "validation"), `group_id` (a file name without
             separators), `images` (N paths or PIL images), `masks` (N paths, PIL images or (H, W) bool arrays), and
-            optionally `surface` ("mirror", "transparent" or None), `image_names` (N strings; default the files' names),
-            `valids` (like masks, or empty), `depths` (N paths of 16-bit PNGs or (H, W) uint16 arrays in mm, 0 = unknown,
-            or empty) and `reference` (path or PIL image). Image files are copied as they are, PIL images become PNG.
+            optionally `surface` ("mirror", "transparent" or None), `image_names` (N strings; default the files'
+            names), `valids` (like masks, or empty), `depths` (N paths of 16-bit PNGs or (H, W) uint16 arrays in mm,
+            0 = unknown, or empty) and `reference` (path or PIL image). Image files are copied, PIL images become PNG.
         folder (`str` or `Path`): made if it does not exist.
         license (`str`): for the card, for example "cc-by-4.0".
 

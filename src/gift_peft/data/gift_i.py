@@ -130,7 +130,7 @@ def load_gift_i(
     Groups stay in the dataset's order, images come in natural order, images listed twice are dropped. Rows are decoded
     when accessed, upright and 8-bit RGB. With `teacher`, accessed rows also have `proxies` (N, h, w) and
     `reference_proxy` (h, w) or None, float32 tensors, read from their own file and checked against the teacher's
-    weights and the decoded images. Proxies stay when the dataset is sliced, shuffled, selected or given to a DataLoader.
+    weights and the decoded images. Slices, shuffles, selections and DataLoader workers keep them.
 
     Args:
         path (`str` or `Path`): a prepared folder, a raw tree, a folder of parquet files, or a hub dataset id.
@@ -172,6 +172,25 @@ def proxies_command(teacher, path, size=None, proxies_dir=None, revision=None) -
     return shlex.join(["gift-peft", "proxies", *given])
 
 
+def gift_i_splits(path: str | Path) -> list[str]:
+    """Which of train and validation a dataset has, in any of its forms."""
+    folder = Path(path)
+    if not folder.is_dir():
+        return [name for name in SPLITS if name in datasets.get_dataset_split_names(str(path))]
+    prepared = _prepared_splits(folder)
+    if prepared or not _holds_parquet(folder):
+        return prepared or list(list_groups(folder))
+    return [name for name in SPLITS if name in datasets.get_dataset_split_names(str(folder))]
+
+
+def _prepared_splits(folder: Path) -> list[str]:
+    return [name for name in SPLITS if any((folder / name).glob("metadata.*"))]
+
+
+def _holds_parquet(folder: Path) -> bool:
+    return any(folder.glob("*.parquet")) or any(folder.glob("*/*.parquet"))
+
+
 def _load_rows(path: str | Path, split: str) -> datasets.Dataset:
     """Rows whose images are still paths or bytes, under FEATURES."""
     folder = Path(path)
@@ -182,15 +201,14 @@ def _load_rows(path: str | Path, split: str) -> datasets.Dataset:
             if not re.fullmatch(r"[\w.-]+(/[\w.-]+)?", str(path)) or folder.exists():
                 raise FileNotFoundError(f"dataset {path}: no such folder")
             return datasets.load_dataset(str(path), split=split, features=FEATURES)
-        prepared = [name for name in SPLITS if any((folder / name).glob("metadata.*"))]
-        if prepared:
+        if prepared := _prepared_splits(folder):
             # Named here, not left to the card: without one, `datasets` guesses splits from words in path names.
             files = {name: f"{name}/**" for name in prepared}
             _check_split(split, prepared, path)
             return datasets.load_dataset(
                 "imagefolder", data_dir=str(folder), data_files=files, split=split, features=FEATURES
             )
-        if any(folder.glob("*.parquet")) or any(folder.glob("*/*.parquet")):
+        if _holds_parquet(folder):
             return datasets.load_dataset(str(folder), split=split, features=FEATURES)
         _check_split(split, list_groups(folder), path)
         builder = GiftI(data_dir=str(folder))

@@ -130,6 +130,17 @@ def image_digest(image: Image.Image) -> str:
     return digest.hexdigest()
 
 
+def label_items(group_id: str, names: Sequence[str], kind: str, items: Sequence | None, optional: bool = False):
+    """Pairs (item, how to call it in a message), one per image name; ValueError if their number differs.
+
+    `optional`: there may be none at all.
+    """
+    items = [] if items is None else list(items)
+    if len(items) != len(names) and (items or not optional):
+        raise ValueError(f"group {group_id}: {len(names)} image names, but {len(items)} {kind}s")
+    return [(item, f"group {group_id}: the {kind} of {name}") for item, name in zip(items, names, strict=False)]
+
+
 def check_group(
     group_id: str,
     names: Sequence[str],
@@ -146,8 +157,6 @@ def check_group(
     parts += [(kind, [array.shape for array in arrays]) for kind, arrays in (("mask", masks), ("valid mask", valids))]
     parts += [("depth", [array.shape for array in depths])]
     for kind, shapes in parts:
-        if len(shapes) != len(names) and (shapes or kind in ("image", "mask")):
-            raise ValueError(f"group {group_id}: {len(names)} image names, but a list of {len(shapes)} for {kind}")
         for name, shape in zip(names, shapes, strict=False):
             if tuple(shape) != size:
                 raise ValueError(
@@ -257,15 +266,12 @@ def collate_group(row: dict, processor, size: tuple[int, int]) -> Group:
     not 8-bit RGB, and proxies made at another size.
     """
     group_id, names = row["group_id"], list(row["image_names"])
-    label = [f"group {group_id}, image {name}" for name in names]
-    images = [to_rgb(image, at) for image, at in zip(row["images"], label, strict=False)]
-    masks = [to_mask(mask, f"{at}: its mask") for mask, at in zip(row["masks"], label, strict=False)]
-    valids = [
-        to_mask(valid, f"{at}: its valid mask") for valid, at in zip(row.get("valids") or [], label, strict=False)
-    ]
-    depths = [np.asarray(depth) for depth in row.get("depths") or []]
+    images = [to_rgb(*item) for item in label_items(group_id, names, "image", row["images"])]
+    masks = [to_mask(*item) for item in label_items(group_id, names, "mask", row["masks"])]
+    valids = [to_mask(*item) for item in label_items(group_id, names, "valid mask", row.get("valids"), True)]
+    depths = [np.asarray(depth) for depth, _ in label_items(group_id, names, "depth", row.get("depths"), True)]
     reference = row.get("reference")
-    reference = None if reference is None else to_rgb(reference, f"group {group_id}, reference")
+    reference = None if reference is None else to_rgb(reference, f"group {group_id}: the reference")
     check_group(group_id, names, images, masks, valids, depths, reference)
     surface = row.get("surface")
     return Group(

@@ -18,6 +18,8 @@ import safetensors
 import safetensors.torch
 import torch
 
+from gift_peft.data.preprocess import image_digest
+
 FORMAT = "gift-peft proxies 1"
 
 
@@ -100,18 +102,23 @@ def write_proxies(path: Path, header: dict[str, str], proxies: torch.Tensor, ref
         leftover.unlink(missing_ok=True)
 
 
-def make_header(
-    teacher: str, revision: str, size: tuple[int, int], settings: dict, images: Sequence[str], reference: str
-):
-    """The metadata of a proxy file (safetensors: strings only). `images` and `reference` are digests."""
+def make_header(teacher: str, revision: str, size: tuple[int, int], settings: dict) -> dict[str, str]:
+    """The part of a file's header that all groups share (safetensors: strings only); `row_digests` is the rest."""
     return {
         "format": FORMAT,
         "teacher": teacher,
         "revision": revision,
         "size": f"{size[0]}x{size[1]}",
         "processor": json.dumps(settings, sort_keys=True),
-        "images": json.dumps(list(images)),
-        "reference": reference,
+    }
+
+
+def row_digests(row: dict) -> dict[str, str]:
+    """The part of a header that pins one group's pixels: `images`, in order, and `reference` ("" if none)."""
+    reference = row["reference"]
+    return {
+        "images": json.dumps([image_digest(image) for image in row["images"]]),
+        "reference": "" if reference is None else image_digest(reference),
     }
 
 
@@ -121,7 +128,9 @@ def read_header(path: Path) -> dict[str, str]:
         with safetensors.safe_open(path, framework="pt") as file:
             return file.metadata() or {}
     except safetensors.SafetensorError as error:
-        raise ValueError(f"damaged proxy file {path} ({str(error).splitlines()[0]})") from None
+        raise ValueError(
+            f"damaged proxy {path} ({str(error).splitlines()[0]}); make it again with --overwrite"
+        ) from None
 
 
 def difference(header: dict[str, str], expected: dict[str, str], names: Sequence[str]) -> str | None:
@@ -155,20 +164,17 @@ class ProxyStore:
     expected: dict[str, str]
     command: str
 
-    def path(self, group_id: str) -> Path:
-        return Path(self.folder) / f"{group_id}.safetensors"
-
-    def read(self, group_id: str, names: Sequence[str], images: Sequence[str], reference: str):
-        """(proxies (N, h, w), reference (h, w) or None), both float32; digests as in `make_header`.
+    def read(self, row: dict) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """(proxies (N, h, w), reference (h, w) or None), float32, of a decoded row.
 
         Raises FileNotFoundError for a missing file and ValueError for a stale, damaged or NaN one, naming it and the
         command that makes it again.
         """
-        path = self.path(group_id)
+        names = row["image_names"]
+        path = Path(self.folder) / f"{row['group_id']}.safetensors"
         if not path.exists():
             raise FileNotFoundError(f"missing proxy {path}; make it with `{self.command}`")
-        expected = {**self.expected, "images": json.dumps(list(images)), "reference": reference}
-        reason = difference(read_header(path), expected, names)
+        reason = difference(read_header(path), {**self.expected, **row_digests(row)}, names)
         if reason:
             raise ValueError(f"stale proxy {path}: {reason}; make it again with `{self.command} --overwrite`")
         tensors = safetensors.torch.load_file(path)

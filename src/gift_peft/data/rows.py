@@ -11,7 +11,7 @@ from datasets import formatting
 from datasets.formatting.formatting import Formatter
 from PIL import Image
 
-from gift_peft.data.preprocess import check_group, image_digest, open_image, to_mask, to_rgb
+from gift_peft.data.preprocess import check_group, open_image, to_mask, to_rgb
 from gift_peft.data.proxies import ProxyStore
 
 FORMAT_TYPE = "gift_i"
@@ -49,7 +49,7 @@ class GiftIFormatter(Formatter):
         if pictures.keys() == {*IMAGE_COLUMNS, "reference"} and {"group_id", "image_names"} <= row.keys():
             self._check(row)
             if self.proxies is not None:
-                row["proxies"], row["reference_proxy"] = self._read_proxies(row)
+                row["proxies"], row["reference_proxy"] = self.proxies.read(row)
         return {key: row[key] for key in [*stored, *(key for key in row if key not in stored)]}
 
     def _picture(self, column: str, item: dict, at: str) -> Image.Image:
@@ -70,11 +70,6 @@ class GiftIFormatter(Formatter):
         valids = [to_mask(mask, label) for mask in row["valids"]]
         depths = [np.asarray(depth) for depth in row["depths"]]
         check_group(group_id, names, row["images"], masks, valids, depths, row["reference"], train=self.train)
-
-    def _read_proxies(self, row: dict):
-        images = [image_digest(image) for image in row["images"]]
-        reference = "" if row["reference"] is None else image_digest(row["reference"])
-        return self.proxies.read(row["group_id"], row["image_names"], images, reference)
 
 
 def _open(item: dict, fallback: str) -> tuple[Image.Image, str]:

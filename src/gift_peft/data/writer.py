@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from gift_peft.data.preprocess import SURFACES, check_group, image_digest, open_image, to_mask, to_rgb
+from gift_peft.data.preprocess import SURFACES, check_group, image_digest, label_items, open_image, to_mask, to_rgb
 
 SPLITS = ("train", "validation")
 NAMES = pa.list_(pa.string())
@@ -118,13 +118,12 @@ def _write_group(group: dict, folder: Path) -> dict:
     if surface is not None and surface not in SURFACES:
         raise ValueError(f"group {group_id}: surface {surface!r}; it is one of {', '.join(SURFACES)} or None")
     names = list(group.get("image_names") or _default_names(group["images"]))
-    label = [f"group {group_id}, image {name}" for name in names]
-    images = [_rgb(image, at) for image, at in zip(group["images"], label, strict=False)]
-    masks = [_mask(mask, f"{at}: its mask") for mask, at in zip(group["masks"], label, strict=False)]
-    valids = [_mask(mask, f"{at}: its valid mask") for mask, at in zip(group.get("valids") or [], label, strict=False)]
-    depths = [_depth(depth, f"{at}: its depth") for depth, at in zip(group.get("depths") or [], label, strict=False)]
+    images = [_rgb(*item) for item in label_items(group_id, names, "image", group["images"])]
+    masks = [_mask(*item) for item in label_items(group_id, names, "mask", group["masks"])]
+    valids = [_mask(*item) for item in label_items(group_id, names, "valid mask", group.get("valids"), True)]
+    depths = [_depth(*item) for item in label_items(group_id, names, "depth", group.get("depths"), True)]
     reference = group.get("reference")
-    reference_image = None if reference is None else _rgb(reference, f"group {group_id}, reference")
+    reference_image = None if reference is None else _rgb(reference, f"group {group_id}: the reference")
     check_group(group_id, names, images, masks, valids, depths, reference_image, train=group["split"] == "train")
     least = 1 if group["split"] == "validation" and reference is not None else 2
     if len({image_digest(image) for image in images}) < max(least, len(images)):

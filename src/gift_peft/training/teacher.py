@@ -1,0 +1,158 @@
+"""The teacher: the frozen base model, asked once for every image before training starts (paper section 4, proxies).
+
+Proxies are float32 and made with the same cut into micro-batches as the group step, so at the first training step the
+self-distillation of a model whose adapter is still zero is exactly zero.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from accelerate import PartialState
+from accelerate.utils import gather_object
+from tqdm import tqdm
+
+from gift_peft.data.gift_i import gift_i_splits, load_gift_i, proxies_command
+from gift_peft.data.preprocess import pixel_settings, resolve_size, to_pixel_values
+from gift_peft.data.proxies import (
+    default_proxies_dir,
+    difference,
+    make_header,
+    read_header,
+    row_digests,
+    teacher_id,
+    teacher_revision,
+    write_proxies,
+)
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+__all__ = ["load_teacher", "make_proxies", "predict_group", "teacher_id", "teacher_revision"]
+
+
+def load_teacher(base: str | Path, revision: str | None = None) -> tuple[torch.nn.Module, object]:
+    """(model in float32 and eval mode, image processor) of a hub id or folder; ValueError if it is neither."""
+    from transformers import AutoImageProcessor, AutoModelForDepthEstimation
+
+    try:
+        model = AutoModelForDepthEstimation.from_pretrained(base, revision=revision, dtype=torch.float32)
+        return model.eval(), AutoImageProcessor.from_pretrained(base, revision=revision)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"base model {base}: {str(error).strip().splitlines()[0]}") from error
+
+
+@torch.no_grad()
+def predict_group(model: torch.nn.Module, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
+    """(N, 3, h, w) to (N, H, W) float32 on the CPU: forwards of `batch_size` in image order, never in half precision.
+
+    The model's mode is left as it is. `model(pixel_values=x)` returns a tensor or has `.predicted_depth`.
+    """
+    device = next(model.parameters()).device
+    predictions = []
+    with torch.autocast(device.type, enabled=False):
+        for batch in pixel_values.split(batch_size):
+            output = model(pixel_values=batch.to(device))
+            output = getattr(output, "predicted_depth", output)
+            predictions.append(output.float().cpu())
+    return torch.cat(predictions)
+
+
+def make_proxies(
+    base: str | Path,
+    dataset_path: str | Path,
+    splits: Sequence[str] | None = None,
+    size: tuple[int, int] | str | None = None,
+    batch_size: int = 2,
+    proxies_dir: str | Path | None = None,
+    revision: str | None = None,
+    accelerator: "Accelerator | None" = None,
+    overwrite: bool = False,
+) -> Path:
+    """Predict every image and treated reference of a dataset and keep it for training and evaluation.
+
+    Can be stopped at any moment and started again: finished groups are kept, each file is whole or absent. Several
+    processes (`accelerate launch`) share the groups; the files do not depend on how many there are.
+
+    Args:
+        base (`str` or `Path`): the teacher, a hub id or a folder.
+        dataset_path (`str` or `Path`): anything `load_gift_i` takes.
+        splits (`Sequence[str]`, *optional*): default all that the dataset has.
+        size (`tuple[int, int]` or `str`, *optional*): (h, w) or "HxW"; default the recipe's, else the processor's.
+        batch_size (`int`): images per forward. Must equal training's micro-batch.
+        proxies_dir (`str` or `Path`, *optional*): default the dataset's own `proxies` folder, or a cache folder for
+            hub ids and folders that cannot be written (`default_proxies_dir`).
+        accelerator (`Accelerator`, *optional*): its device and processes; default what `accelerate launch` set up.
+        overwrite (`bool`): make every proxy again instead of refusing stale ones.
+
+    Returns:
+        `Path`: `<proxies_dir>/<teacher>`.
+
+    Raises:
+        ValueError, FileNotFoundError: in every process, one line naming the file, or group and image: stale proxies,
+            NaN predictions, unreadable data.
+    """
+    from gift_peft.adapters import RECIPES
+
+    state = accelerator or PartialState()
+    identity = teacher_id(base, revision)
+    pinned = teacher_revision(base, revision)
+    model, processor = load_teacher(base, revision)
+    size = resolve_size(size, RECIPES.get(model.config.model_type), processor, model.config)
+    model.to(state.device)
+    folder = Path(proxies_dir or default_proxies_dir(dataset_path, identity)) / identity
+    command = proxies_command(base, dataset_path, f"{size[0]}x{size[1]}", proxies_dir, revision)
+    header = make_header(identity, pinned, size, pixel_settings(processor))
+    problem = None
+    try:
+        for split in splits or gift_i_splits(dataset_path):
+            dataset = load_gift_i(dataset_path, split)
+            mine = range(state.process_index, len(dataset), state.num_processes)
+            for index in tqdm(
+                mine, desc=f"proxies, {split}", unit="group", delay=2, disable=not state.is_main_process
+            ):
+                row = dataset[index]
+                path = folder / split / f"{row['group_id']}.safetensors"
+                expected = header | row_digests(row)
+                if overwrite or not _is_current(path, expected, row["image_names"], command):
+                    write_proxies(path, expected, *_predict_row(model, processor, row, size, batch_size))
+    except (ValueError, FileNotFoundError) as error:
+        problem = error
+    _raise_everywhere(problem, state)
+    return folder
+
+
+def _is_current(path: Path, expected: dict[str, str], names: Sequence[str], command: str) -> bool:
+    """Whether a group's proxies exist and hold; ValueError if they exist and do not."""
+    if not path.exists():
+        return False
+    reason = difference(read_header(path), expected, names)
+    if reason:
+        raise ValueError(f"stale proxy {path}: {reason}; make it again with `{command} --overwrite`")
+    return True
+
+
+def _predict_row(model, processor, row: dict, size: tuple[int, int], batch_size: int):
+    """(proxies (N, h, w), reference (h, w) or None) of one row; ValueError naming the image of a bad prediction."""
+    names, images = list(row["image_names"]), row["images"]
+    proxies = predict_group(model, to_pixel_values(images, processor, size), batch_size)
+    reference = None
+    if row["reference"] is not None:
+        reference = predict_group(model, to_pixel_values([row["reference"]], processor, size))[0]
+    for name, proxy in [*zip(names, proxies, strict=True), ("the reference", reference)]:
+        if proxy is not None and tuple(proxy.shape) != tuple(size):
+            raise ValueError(
+                f"the model predicts {tuple(proxy.shape)} for images of {tuple(size)}; they must be equal"
+            )
+        if proxy is not None and not torch.isfinite(proxy).all():
+            raise ValueError(f"group {row['group_id']}, {name}: the teacher's prediction has NaN or infinite values")
+    return proxies, reference
+
+
+def _raise_everywhere(problem: Exception | None, state) -> None:
+    """Raise the first process's problem in all, so that none waits for one that has stopped."""
+    problems = [problem] if state.num_processes == 1 else gather_object([problem])
+    problem = next((problem for problem in problems if problem is not None), None)
+    if problem is not None:
+        raise problem

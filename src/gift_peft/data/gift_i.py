@@ -124,6 +124,7 @@ def load_gift_i(
     proxies_dir: str | Path | None = None,
     revision: str | None = None,
     size: tuple[int, int] | None = None,
+    dataset_revision: str | None = None,
 ) -> datasets.Dataset:
     """GIFT-I groups, checked, as a `datasets.Dataset` with `FEATURES`; with a teacher also their proxies.
 
@@ -140,11 +141,12 @@ def load_gift_i(
             dataset's own `proxies` folder (see `default_proxies_dir`).
         revision (`str`, *optional*): of the teacher.
         size (`tuple[int, int]`, *optional*): (h, w) that the proxies must have.
+        dataset_revision (`str`, *optional*): of a hub dataset.
 
     Raises:
         FileNotFoundError, ValueError: one line that names the file or group and says what to do.
     """
-    dataset = _load_rows(path, split)
+    dataset = _load_rows(path, split, dataset_revision)
     name = re.match(r"\w*", str(split)).group()
     dataset = _check_rows(dataset, name, path)
     store = None
@@ -191,7 +193,7 @@ def _holds_parquet(folder: Path) -> bool:
     return any(folder.glob("*.parquet")) or any(folder.glob("*/*.parquet"))
 
 
-def _load_rows(path: str | Path, split: str) -> datasets.Dataset:
+def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.Dataset:
     """Rows whose images are still paths or bytes, under FEATURES."""
     folder = Path(path)
     if "+" in str(split):
@@ -200,7 +202,7 @@ def _load_rows(path: str | Path, split: str) -> datasets.Dataset:
         if not folder.is_dir():
             if not re.fullmatch(r"[\w.-]+(/[\w.-]+)?", str(path)) or folder.exists():
                 raise FileNotFoundError(f"dataset {path}: no such folder")
-            return datasets.load_dataset(str(path), split=split, features=FEATURES)
+            return datasets.load_dataset(str(path), split=split, features=FEATURES, revision=revision)
         if prepared := _prepared_splits(folder):
             # Named here, not left to the card: without one, `datasets` guesses splits from words in path names.
             files = {name: f"{name}/**" for name in prepared}

@@ -18,6 +18,7 @@ import torch
 from PIL import Image, ImageOps
 
 SURFACES = ["mirror", "transparent"]
+SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm"}
 SINGLE_CHANNEL = ("1", "L", "P", "I", "I;16", "I;16B", "I;16L")
 
 
@@ -52,6 +53,11 @@ class Group:
 
 
 # ---- decoding ----
+
+
+def is_image_file(path: Path) -> bool:
+    """Whether a folder's entry counts as a picture: by its suffix, and not hidden."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
 
 
 def open_image(source: str | Path | bytes | Image.Image, name: str | None = None) -> Image.Image:

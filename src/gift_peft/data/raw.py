@@ -14,12 +14,19 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from gift_peft.data.preprocess import SURFACES, check_group, image_digest, open_image, read_image, to_mask
+from gift_peft.data.preprocess import (
+    SURFACES,
+    check_group,
+    image_digest,
+    is_image_file,
+    open_image,
+    read_image,
+    to_mask,
+)
 
 logger = logging.getLogger(__name__)
 
 SPLITS = ("train", "validation")
-SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm"}
 GROUP_KEYS = {"surface", "notes", "mask_class"}
 
 
@@ -116,8 +123,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    pictures = (path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith("."))
-    return sorted(pictures, key=lambda path: natural_key(path.name))
+    return sorted(filter(is_image_file, folder.iterdir()), key=lambda path: natural_key(path.name))
 
 
 def _images(folder: Path) -> list[Path]:

@@ -17,8 +17,8 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from gift_peft.data.preprocess import SURFACES, check_group, image_digest, label_items, open_image, to_mask, to_rgb
+from gift_peft.data.raw import SPLITS
 
-SPLITS = ("train", "validation")
 NAMES = pa.list_(pa.string())
 SCHEMA = pa.schema(
     [

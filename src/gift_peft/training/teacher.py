@@ -80,7 +80,7 @@ def make_proxies(
         dataset_path (`str` or `Path`): anything `load_gift_i` takes.
         splits (`Sequence[str]`, *optional*): default all that the dataset has.
         size (`tuple[int, int]` or `str`, *optional*): (h, w) or "HxW"; default the recipe's, else the processor's.
-        batch_size (`int`): images per forward. Must equal training's micro-batch.
+        batch_size (`int`): images per forward; predictions equal training's to the bit if it has the same.
         proxies_dir (`str` or `Path`, *optional*): default the dataset's own `proxies` folder, or a cache folder for
             hub ids and folders that cannot be written (`default_proxies_dir`).
         accelerator (`Accelerator`, *optional*): its device and processes; default what `accelerate launch` set up.

@@ -12,10 +12,11 @@ from typing import Literal
 
 import yaml
 
+from gift_peft.data.preprocess import parse_size
+
 # What a run may be resumed with when it differs: everything else changes the weights that come out.
 FREE_TO_CHANGE = {
     "dataset_name",  # the folder may move: its content is compared by fingerprint
-    "dataset_revision",
     "proxies_dir",
     "output_dir",
     "overwrite_output_dir",
@@ -50,7 +51,6 @@ class GiftTrainingArguments:
     output_dir: str = _arg("where the run goes: adapters, checkpoints, metrics.jsonl, config.yaml")
     config: str | None = _arg("YAML file with values for these arguments; the command line wins", None)
     model_revision: str | None = _arg("branch, tag or commit of the base model", None)
-    dataset_revision: str | None = _arg("branch, tag or commit of the dataset", None)
     proxies_dir: str | None = _arg("folder of the teacher's predictions; default: DATASET/proxies", None)
     overwrite_output_dir: bool = _arg("delete the run that output_dir holds and start again", False)
 
@@ -65,8 +65,7 @@ class GiftTrainingArguments:
     prediction_kind: Literal["depth", "inverse_depth"] | None = _arg(
         "what the model predicts, for a model without a recipe", None
     )
-    height: int | None = _arg("image height at the network; default: the recipe's (476)", None)
-    width: int | None = _arg("image width at the network; default: the recipe's (644)", None)
+    size: str | None = _arg("HEIGHTxWIDTH at the network; default: the recipe's (476x644)", None)
 
     lambda_c: float = _arg("weight of the group consistency, Eq. 6", 1.0)
     lambda_d: float = _arg("weight of the self-distillation, Eq. 6; 0 collapses the depth", 1.0)
@@ -108,8 +107,8 @@ class GiftTrainingArguments:
                 self.retain = int(self.retain)
             except ValueError:
                 raise ValueError(f"retain: expected auto or a number of images, got {self.retain!r}") from None
-        if (self.height is None) != (self.width is None):
-            raise ValueError("height and width: give both or neither")
+        if self.size is not None:
+            parse_size(self.size)
         for name in (
             "lora_rank",
             "micro_batch_size",
@@ -130,11 +129,6 @@ class GiftTrainingArguments:
             raise ValueError(f"max_steps: must be at least 1, or -1, got {self.max_steps}")
         if self.overwrite_output_dir and self.resume_from_checkpoint:
             raise ValueError("overwrite_output_dir and resume_from_checkpoint exclude each other")
-
-    @property
-    def size(self) -> tuple[int, int] | None:
-        """(height, width) at the network, or None for the recipe's."""
-        return None if self.height is None else (self.height, self.width)
 
     def to_yaml(self) -> str:
         """All values as `--config` reads them, without what is None or empty and without the two about resuming."""

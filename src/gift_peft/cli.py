@@ -1,0 +1,173 @@
+"""`gift-peft`: one verb per step. Thin: the work lives in the modules that own it, imported when it is asked for.
+
+An error of ours is one line on stderr and exit code 1; wrong usage of a verb is argparse's 2; a run stopped by Ctrl-C
+or SIGTERM ends with 130 or 143, as a shell expects. `--debug` or GIFT_PEFT_DEBUG=1 shows the traceback.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run a verb and leave through `sys.exit`."""
+    parser = _parser()
+    args, rest = parser.parse_known_args(argv)
+    if rest and args.verb not in ("demo", "train"):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    debug = args.debug or os.environ.get("GIFT_PEFT_DEBUG", "0") not in ("", "0")
+    try:
+        if not debug:
+            _quiet()
+        code = args.run(args, rest)
+    except KeyboardInterrupt:
+        print("gift-peft: stopped", file=sys.stderr)
+        code = 130
+    except (ValueError, OSError) as error:
+        if debug:
+            raise
+        print(f"gift-peft: error: {' '.join(str(error).split())}", file=sys.stderr)
+        code = 1
+    sys.exit(code)
+
+
+def _parser() -> argparse.ArgumentParser:
+    debug = argparse.ArgumentParser(add_help=False)
+    debug.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    parser = argparse.ArgumentParser(
+        prog="gift-peft",
+        description="Teach the depth model you already use to see mirrors and glass.",
+        allow_abbrev=False,
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    def verb(name, run, text, **options):
+        sub = verbs.add_parser(name, parents=[debug], help=text, description=text, allow_abbrev=False, **options)
+        sub.set_defaults(run=run)
+        return sub
+
+    demo = verb(
+        "demo", _demo, "train and evaluate the embedded model on the embedded groups; more options go to train"
+    )
+    demo.add_argument("--out", default="demo", help="folder for adapter, table and pictures (default: demo)")
+    demo.add_argument("--seed", type=int, default=0)
+    demo.add_argument("--overwrite_output_dir", action="store_true", help="delete an earlier demo in --out")
+
+    proxies = verb("proxies", _proxies, "keep the frozen model's predictions for a dataset")
+    _add_model_and_data(proxies)
+    proxies.add_argument("--splits", nargs="+", metavar="SPLIT", help="default: all")
+    proxies.add_argument("--proxies_dir", help="default: DATASET/proxies")
+    proxies.add_argument("--overwrite", action="store_true", help="make every proxy again")
+
+    # Its own parser knows the arguments (`gift-peft train --help`).
+    verb("train", _train, "fine-tune a model on groups of images into an adapter", add_help=False)
+
+    evaluate = verb("evaluate", _evaluate, "compare base and adapter on validation groups")
+    _add_model_and_data(evaluate)
+    _add_adapter(evaluate)
+    evaluate.add_argument("--split", default="validation")
+    evaluate.add_argument("--reference", choices=["proxy", "depth"], default="proxy", help="what to compare with")
+    evaluate.add_argument("--protocol", help="default: native against proxies, gift against depth")
+    evaluate.add_argument("--out", default="evaluation", help="folder for metrics.json, rows.jsonl, report.md")
+
+    predict = verb("predict", _predict, "depth of pictures, beside the base's")
+    predict.add_argument("images", nargs="+", metavar="IMAGE", help="picture files or folders of them")
+    _add_model(predict)
+    _add_adapter(predict)
+    predict.add_argument("--out", required=True, help="folder for the npy and png files")
+    return parser
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--base", required=True, help="base model: hub id or folder")
+    parser.add_argument("--revision", help="branch, tag or commit of the base model")
+    parser.add_argument("--size", metavar="HxW", help="at the network; default: the adapter's, else the recipe's")
+
+
+def _add_model_and_data(parser: argparse.ArgumentParser) -> None:
+    _add_model(parser)
+    parser.add_argument(
+        "--dataset", required=True, help="GIFT-I: raw tree, prepared folder, parquet release or hub id"
+    )
+
+
+def _add_adapter(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--adapter", help="adapter: hub id or folder")
+    parser.add_argument("--adapter-scale", type=float, help="0 is the base, 1 the adapter")
+    parser.add_argument("--kind", choices=["depth", "inverse_depth"], help="of a model without a recipe")
+
+
+def _demo(args: argparse.Namespace, rest: list[str]) -> int:
+    from gift_peft.demo.run import run_demo
+
+    run_demo(out=args.out, overwrite_output_dir=args.overwrite_output_dir, seed=args.seed, extra=rest)
+    return 0
+
+
+def _proxies(args: argparse.Namespace, rest: list[str]) -> int:
+    from gift_peft.training.teacher import make_proxies
+
+    folder = make_proxies(
+        args.base,
+        args.dataset,
+        splits=args.splits,
+        size=args.size,
+        proxies_dir=args.proxies_dir,
+        revision=args.revision,
+        overwrite=args.overwrite,
+    )
+    print(f"Proxies: {folder}")
+    return 0
+
+
+def _train(args: argparse.Namespace, rest: list[str]) -> int:
+    from gift_peft.training import parse_arguments, train
+
+    result = train(parse_arguments(rest))
+    return 128 + result.signal if result.signal else 0
+
+
+def _evaluate(args: argparse.Namespace, rest: list[str]) -> int:
+    from gift_peft.evaluation.evaluate import run_evaluation
+
+    run_evaluation(
+        args.base,
+        args.dataset,
+        args.adapter,
+        reference=args.reference,
+        protocol=args.protocol,
+        split=args.split,
+        out=args.out,
+        adapter_scale=args.adapter_scale,
+        size=args.size,
+        kind=args.kind,
+        revision=args.revision,
+        color=sys.stdout.isatty() and "NO_COLOR" not in os.environ,
+    )
+    return 0
+
+
+def _predict(args: argparse.Namespace, rest: list[str]) -> int:
+    from gift_peft.evaluation.predict import predict_images
+
+    files = predict_images(
+        args.images,
+        args.base,
+        args.adapter,
+        args.adapter_scale,
+        out=args.out,
+        size=args.size,
+        kind=args.kind,
+        revision=args.revision,
+    )
+    print(f"Written: {len(files)} depth maps in {args.out}")
+    return 0
+
+
+def _quiet() -> None:
+    """Our own lines and bars are enough; those of the libraries come back with --debug."""
+    os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
+    os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+    os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
+    os.environ.setdefault("TRANSFORMERS_NO_ADVISORY_WARNINGS", "1")

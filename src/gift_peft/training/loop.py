@@ -1,0 +1,400 @@
+"""A GIFT run from arguments to adapter (paper section 4, implementation details): the loop, top to bottom.
+
+Frozen model -> proxies -> adapter with the paper's trainable parts -> one Adam update per group of images, the groups
+shuffled once per epoch -> validation after every epoch -> the adapter with the smallest validation GCE.
+"""
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from accelerate import Accelerator
+from accelerate.utils import broadcast_object_list, set_seed
+from transformers import AutoImageProcessor, AutoModelForDepthEstimation
+
+from gift_peft.adapters import GiftRecipe, get_gift_model, get_recipe, save_adapter
+from gift_peft.data.gift_i import dataset_fingerprint, gift_i_splits, load_gift_i, proxies_command
+from gift_peft.data.preprocess import Group, resolve_size
+from gift_peft.data.proxies import teacher_revision
+from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.metrics import METRICS
+from gift_peft.evaluation.results import REGIONS, jsonable, write_text
+from gift_peft.group_step import GroupStep
+from gift_peft.losses import GeometryConsistencyError
+from gift_peft.training import card, checkpoints
+from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
+from gift_peft.training.groups import PreparedGroups, epoch_order
+from gift_peft.training.progress import Progress
+from gift_peft.training.start import make_accelerator, open_run, stop_signals
+from gift_peft.training.teacher import make_proxies
+
+
+@dataclass
+class TrainResult:
+    """What `train` leaves behind.
+
+    Args:
+        output_dir (`Path`): holds `adapter/`, `adapter-last/`, `checkpoint-*/`, `metrics.jsonl`, `config.yaml`.
+        step (`int`): updates made.
+        metrics (`list[dict]`): the rows of metrics.jsonl.
+        best_step (`int`, *optional*): the step of `adapter/`; None without validation GCE.
+        signal (`int`, *optional*): the signal that stopped the run early (a checkpoint was written).
+    """
+
+    output_dir: Path
+    step: int
+    metrics: list[dict]
+    best_step: int | None
+    signal: int | None = None
+
+
+@dataclass
+class State:
+    """Where a run stands; all of it is in `trainer_state.json`. The sums are over the groups of this epoch so far."""
+
+    step: int = 0
+    rows: list[dict] = field(default_factory=list)
+    best_step: int | None = None
+    loss: float = 0.0
+    consistency: float = 0.0
+    distillation: float = 0.0
+    gce: float = 0.0
+    num_groups: int = 0
+    num_groups_with_pair: int = 0
+
+    def add(self, loss: float, consistency: float, distillation: float, num_pairs: int) -> None:
+        """Count one group."""
+        self.loss += loss
+        self.consistency += consistency
+        self.distillation += distillation
+        self.num_groups += 1
+        if num_pairs:  # GCE leaves out groups without a pair, the loss counts them as 0
+            self.gce += consistency
+            self.num_groups_with_pair += 1
+
+    def close_epoch(self, epoch_steps: int) -> dict:
+        """The means since the last row, as the first half of a row; the sums start again."""
+        row = {"step": self.step, "epoch": self.step / epoch_steps}
+        for name in ("loss", "consistency", "distillation"):
+            row[name] = getattr(self, name) / self.num_groups if self.num_groups else None
+            setattr(self, name, 0.0)
+        row["train_gce"] = self.gce / self.num_groups_with_pair if self.num_groups_with_pair else None
+        self.gce, self.num_groups, self.num_groups_with_pair = 0.0, 0, 0
+        return row
+
+
+def train(args: GiftTrainingArguments) -> TrainResult:
+    """Run, or go on with, a training; see `GiftTrainingArguments`.
+
+    Raises ValueError, FileNotFoundError or OSError with one line that names the argument, file or group. A NaN stops
+    the run with the group's name; the last checkpoint stays good.
+    """
+    accelerator = make_accelerator(args)
+    output, checkpoint = open_run(args, accelerator)
+    run = Run(args, output, accelerator)
+    state = run.restore(checkpoint) if checkpoint else State()
+    progress = Progress(run.total_steps, state.step, accelerator.is_main_process)
+    progress.say(run.describe(state, checkpoint))
+    feed = run.groups_from(state.step)
+    try:
+        with stop_signals(progress.say) as stop:
+            while not (signum := run.agree(stop.signum)):
+                if run.row_is_due(state):
+                    run.finish_epoch(state)
+                    progress.row(state.rows[-1], run.total_steps / run.epoch_steps)
+                if state.step >= run.total_steps:
+                    break
+                progress.step(*run.update(next(feed), state))
+            if signum:
+                run.save_checkpoint(state)
+    finally:
+        feed.close()
+        progress.close()
+    if signum:
+        progress.say(_how_to_resume(output, state.step))
+    else:
+        run.finish(state)
+    accelerator.end_training()
+    return TrainResult(output, state.step, state.rows, state.best_step, signum or None)
+
+
+class Run:
+    """The parts of one run: data with proxies, the model with its adapter, optimizer, group step."""
+
+    def __init__(self, args: GiftTrainingArguments, output: Path, accelerator: Accelerator) -> None:
+        self.args, self.output, self.accelerator = args, output, accelerator
+        source = {"revision": args.model_revision}
+        # Float32 weights whatever the checkpoint's: bf16 is autocast's business (paper, implementation details).
+        base = AutoModelForDepthEstimation.from_pretrained(args.model_name_or_path, dtype=torch.float32, **source)
+        self.processor = AutoImageProcessor.from_pretrained(args.model_name_or_path, **source)
+        self.recipe = get_recipe(base, _generic_recipe(args))
+        self.kind = self.recipe.kind_for(base.config)
+        self.model_type = base.config.model_type
+        self.size = resolve_size(args.size, self.recipe, self.processor, base.config)
+        self.train_groups, self.validation_groups = self._data()
+        self.epoch_steps = len(self.train_groups)
+        self.total_steps = args.max_steps if args.max_steps > 0 else args.num_train_epochs * self.epoch_steps
+        self.identity = self._identity()
+
+        set_seed(args.seed)  # the same on every process, so that the adapters start equal
+        model = get_gift_model(base, rank=args.lora_rank, head=args.head, recipe=self.recipe)
+        # No DDP: GroupStep sums the gradients of a group over the processes itself, and autocasts itself, so that
+        # validation and the proxies stay in float32. Eval mode: a replay must repeat its snapshot.
+        self.model = model.to(accelerator.device).eval()
+        self.optimizer = torch.optim.Adam(
+            [p for p in model.parameters() if p.requires_grad],
+            lr=args.learning_rate,
+            betas=(args.adam_beta1, args.adam_beta2),
+            eps=args.adam_epsilon,
+            weight_decay=args.weight_decay,
+        )
+        self.group_step = GroupStep(
+            self.model, args.lambda_c, args.lambda_d, args.micro_batch_size, args.retain, accelerator
+        )
+        if args.report_to != "none":
+            accelerator.init_trackers("gift-peft", {k: str(v) for k, v in asdict(args).items()})
+
+    def _data(self) -> tuple[PreparedGroups, PreparedGroups | None]:
+        """Train and, where there is one, validation groups with their proxies, which are made if missing."""
+        args = self.args
+        places = {"proxies_dir": args.proxies_dir, "revision": args.model_revision, "size": self.size}
+        try:
+            make_proxies(args.model_name_or_path, args.dataset_name, accelerator=self.accelerator, **places)
+        except PermissionError as error:
+            command = proxies_command(args.model_name_or_path, args.dataset_name, args.size, args.proxies_dir)
+            raise PermissionError(f"proxies are missing and {error.filename} cannot be written: `{command}`") from None
+        splits = gift_i_splits(args.dataset_name)
+        if "train" not in splits:
+            raise ValueError(f"dataset_name: {args.dataset_name} has no train split")
+        memory = args.group_cache_gb * 2**30
+        share = {"train": 0.75, "validation": 0.25} if "validation" in splits else {"train": 1}
+        groups = {}
+        for split, part in share.items():
+            rows = load_gift_i(args.dataset_name, split, teacher=args.model_name_or_path, **places)
+            threads = args.dataloader_num_workers
+            groups[split] = PreparedGroups(rows, self.processor, self.size, threads, int(part * memory))
+        return groups["train"], groups.get("validation")
+
+    def _identity(self) -> dict:
+        """What must be the same for a resumed run, under the names of the arguments."""
+        args = self.args
+        identity = {k: v for k, v in asdict(args).items() if k not in FREE_TO_CHANGE}
+        parts = [groups for groups in (self.train_groups, self.validation_groups) if groups]
+        fingerprint = [None]
+        if self.accelerator.is_main_process:
+            fingerprint = ["-".join(dataset_fingerprint(groups.dataset) for groups in parts)]
+        return identity | {
+            "model_name_or_path": teacher_revision(args.model_name_or_path, args.model_revision),
+            "dataset_name": broadcast_object_list(fingerprint)[0],
+            "size": "x".join(map(str, self.size)),
+            "mixed_precision": self.accelerator.mixed_precision,
+        }
+
+    def describe(self, state: State, checkpoint: Path | None) -> str:
+        """The first line of a run."""
+        trained = sum(p.numel() for p in self.model.parameters() if p.requires_grad)
+        validation = len(self.validation_groups) if self.validation_groups else 0
+        text = (
+            f"{self.epoch_steps} train and {validation} validation groups at {self.size[0]}x{self.size[1]}, "
+            f"{self.total_steps} updates of {trained / 1e6:.2f} M weights, autocast {self.accelerator.mixed_precision}"
+        )
+        if not validation:
+            text += "\nNo validation split: adapter/ will be the last adapter, chosen by nothing."
+        return text + (f"\nGoing on from {checkpoint} (step {state.step})" if checkpoint else "")
+
+    def groups_from(self, step: int) -> Iterator[Group]:
+        """The groups of all updates after `step`."""
+        while True:
+            epoch, done = divmod(step, self.epoch_steps)
+            order = epoch_order(self.epoch_steps, self.args.seed, epoch)[done:]
+            yield from self.train_groups.take(order)
+            step += len(order)
+
+    def agree(self, signum: int) -> int:
+        """The signal to stop by, if any process has received one, on all of them."""
+        if self.accelerator.num_processes == 1:
+            return signum
+        received = self.accelerator.gather(torch.tensor([signum], device=self.accelerator.device))
+        return int(received.max())
+
+    def update(self, group: Group, state: State) -> tuple[float, float]:
+        """One Adam step on one group (Eq. 6); returns (loss, consistency)."""
+        try:
+            output = self.group_step.accumulate(group.pixel_values, group.mask, group.target, group.valid, group.names)
+        except ValueError as error:
+            found = checkpoints.list_checkpoints(self.output)
+            last = f"the last good checkpoint is {found[-1]}" if found else "no checkpoint had been written yet"
+            raise ValueError(f"step {state.step + 1}, group {group.group_id}: {error}; {last}") from error
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        state.step += 1
+        loss, consistency, distillation = (float(value) for value in output[:3])
+        state.add(loss, consistency, distillation, output.num_pairs)
+        self.accelerator.log({"loss": loss, "consistency": consistency, "distillation": distillation}, step=state.step)
+        if self._checkpoint_is_due(state.step) and not self.row_is_due(state):
+            self.save_checkpoint(state)
+        return loss, consistency
+
+    def row_is_due(self, state: State) -> bool:
+        """At the start, after every epoch and at the end, unless it was written before an interruption."""
+        at = state.step % self.epoch_steps == 0 or state.step == self.total_steps
+        return at and (not state.rows or state.rows[-1]["step"] != state.step)
+
+    def finish_epoch(self, state: State) -> None:
+        """Validate, write the row, keep the adapter if it is the best so far, write the checkpoint if it is due."""
+        if state.step == 0:
+            self._measure_base(state)
+        row = state.close_epoch(self.epoch_steps) | self._validate()
+        row = {key: jsonable(value) for key, value in row.items()}
+        state.rows.append(row)
+        best = next((r["val_gce"] for r in state.rows if r["step"] == state.best_step), None)
+        if state.step and row["val_gce"] is not None and (best is None or row["val_gce"] < best):
+            state.best_step = state.step
+            self._save_adapter(self.output / "adapter", state)
+        if self.accelerator.is_main_process:
+            write_metrics(self.output, state.rows)
+        self.accelerator.log(
+            {k: v for k, v in row.items() if v is not None and k.startswith(("val", "train"))}, state.step
+        )
+        if state.step and self._checkpoint_is_due(state.step):
+            self.save_checkpoint(state)
+
+    def _measure_base(self, state: State) -> None:
+        """The base's own loss needs no forward: its predictions are the proxies, its distillation is 0."""
+        for group in self.train_groups.take(range(self.epoch_steps)):
+            error = GeometryConsistencyError()
+            consistency = error.update(group.target, group.mask, group.valid)
+            num_pairs = error.num_groups
+            consistency = consistency if num_pairs else 0.0
+            state.add(self.args.lambda_c * consistency, consistency, 0.0, num_pairs)
+
+    def _validate(self) -> dict:
+        """GCE and the errors against the teacher on the treated reference, in float32, spread over the processes."""
+        keys = [f"val_{region}_{metric}" for region in REGIONS for metric in METRICS]
+        if self.validation_groups is None:
+            return dict.fromkeys(["val_gce", *keys])
+        report = evaluate_gift_i(
+            self.validation_groups,
+            self.model,
+            kind=self.kind,
+            baseline=False,
+            accelerator=self.accelerator,
+            progress=False,
+        )
+        values = {f"val_{r}_{m}": report.summary[r][m] for r in REGIONS for m in METRICS}
+        return {"val_gce": report.gce["adapted"], **values}
+
+    def _checkpoint_is_due(self, step: int) -> bool:
+        every = self.args.checkpointing_steps or self.epoch_steps
+        return step % every == 0 or step in self.args.checkpoint_at_steps or step == self.total_steps
+
+    def save_checkpoint(self, state: State) -> None:
+        """`checkpoint-<step>/`, then delete those that are too many."""
+        if self.accelerator.is_main_process:
+            checkpoints.write_checkpoint(
+                self.output,
+                state.step,
+                lambda folder: self._save_adapter(folder, state, with_card=False),
+                self.model,
+                self.optimizer,
+                {"identity": self.identity, **asdict(state)},
+                best=self.output / "adapter" if state.best_step else None,
+            )
+            limit, keep = self.args.checkpoints_total_limit, self.args.checkpoint_at_steps
+            checkpoints.prune_checkpoints(self.output, limit, keep)
+        self.accelerator.wait_for_everyone()
+
+    def restore(self, checkpoint: Path) -> State:
+        """Weights, optimizer, RNG, progress, metrics.jsonl and the best adapter as they were at a checkpoint."""
+        saved = checkpoints.read_state(checkpoint)
+        _check_identity(saved.pop("identity"), self.identity)
+        state = State(**saved)
+        if state.step > self.total_steps:
+            raise ValueError(f"resume_from_checkpoint: {checkpoint} is past the {self.total_steps} steps of this run")
+        checkpoints.read_checkpoint(checkpoint, self.model, self.optimizer)
+        if self.accelerator.is_main_process:
+            write_metrics(self.output, state.rows)
+            best = self.output / "adapter"
+            if state.best_step:
+                with checkpoints.new_folder(best) as folder:
+                    shutil.copytree(checkpoint / checkpoints.BEST, folder, dirs_exist_ok=True)
+            else:
+                shutil.rmtree(best, ignore_errors=True)
+        self.accelerator.wait_for_everyone()
+        return state
+
+    def finish(self, state: State) -> None:
+        """`adapter-last/`, `adapter/` where nothing could choose it, and the upload."""
+        self._save_adapter(self.output / "adapter-last", state)
+        if state.best_step is None:
+            self._save_adapter(self.output / "adapter", state)
+        if self.accelerator.is_main_process:
+            print(f"Adapter: {self.output / 'adapter'} (step {state.best_step or state.step})", flush=True)
+            if self.args.push_to_hub:
+                print(
+                    f"Uploaded to https://huggingface.co/{card.push(self.output / 'adapter', self.args)}", flush=True
+                )
+
+    def _save_adapter(self, folder: Path, state: State, with_card: bool = True) -> None:
+        """The adapter as it is now, with the last row as its metrics. Only the main process writes."""
+        if not self.accelerator.is_main_process:
+            return
+        row = next((r for r in reversed(state.rows) if r["step"] == state.step), None)
+        record = card.run_record(
+            self.args,
+            step=state.step,
+            epoch=state.step / self.epoch_steps,
+            model_type=self.model_type,
+            kind=self.kind,
+            size=list(self.size),
+            num_groups=self.epoch_steps,
+            mixed_precision=self.accelerator.mixed_precision,
+            num_processes=self.accelerator.num_processes,
+            base_revision=self.identity["model_name_or_path"],
+            dataset_fingerprint=self.identity["dataset_name"],
+            metrics={"base": state.rows[0] if state.rows else None, "adapter": row},
+        )
+        save_adapter(
+            self.model,
+            folder,
+            self.args.model_name_or_path,
+            self.args.model_revision,
+            processor=self.processor,
+            size=self.size,
+            gift=record,
+            card=card.model_card(self.args, record) if with_card else None,
+        )
+
+
+def write_metrics(output: Path, rows: list[dict]) -> None:
+    """metrics.jsonl, whole: a resumed run drops the rows after its checkpoint."""
+    write_text(output / "metrics.jsonl", "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+
+
+def _generic_recipe(args: GiftTrainingArguments) -> GiftRecipe | None:
+    """The recipe that the arguments spell out, for a model that has none."""
+    if not (args.target_modules or args.modules_to_save):
+        return None
+    if not (args.target_modules and args.modules_to_save):
+        raise ValueError("target_modules and modules_to_save: give both or neither")
+    return GiftRecipe(args.target_modules, args.modules_to_save, args.prediction_kind)
+
+
+def _check_identity(before: dict, now: dict) -> None:
+    """Raise ValueError naming the first argument that changed since the checkpoint."""
+    changed = {"model_name_or_path": "the base model's weights", "dataset_name": "its images, masks or groups"}
+    for name in sorted(before.keys() | now.keys()):
+        if before.get(name) != now.get(name):
+            what = f"{changed[name]} have" if name in changed else f"{before.get(name)} became {now.get(name)}, it has"
+            raise ValueError(f"resume_from_checkpoint: {name}: {what} changed since the checkpoint was written")
+
+
+def _how_to_resume(output: Path, step: int) -> str:
+    config = output / "config.yaml"
+    return (
+        f"Stopped after step {step}; {output}/checkpoint-{step} is complete. Go on with\n"
+        f"  gift-peft train --config {config} --resume_from_checkpoint latest"
+    )

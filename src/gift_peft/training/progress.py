@@ -1,0 +1,59 @@
+"""What a run says while it runs: on a terminal a bar (loss, GCE, groups/s, time left), and always a line per epoch."""
+
+import sys
+import time
+
+from tqdm import tqdm
+
+from gift_peft.evaluation.report import number
+
+
+class Progress:
+    """Lines go to stdout, the bar to stderr where that is a terminal. Only the main process speaks.
+
+    Args:
+        total, done: updates of the whole run, and those of earlier sessions.
+        enabled: False on all processes but one.
+    """
+
+    def __init__(self, total: int, done: int, enabled: bool) -> None:
+        self.enabled = enabled
+        self.total, self.first, self.done = total, done, done
+        self.started = time.monotonic()
+        self.bar = tqdm(
+            total=total,
+            initial=done,
+            unit="group",
+            desc="GIFT",
+            dynamic_ncols=True,
+            disable=not enabled or not sys.stderr.isatty(),
+        )
+
+    def step(self, loss: float, consistency: float) -> None:
+        """One update has been made."""
+        self.done += 1
+        self.bar.set_postfix(loss=number(loss), GCE=number(consistency), refresh=False)
+        self.bar.update()
+
+    def row(self, row: dict, epochs: float) -> None:
+        """The line of one row of metrics.jsonl."""
+        parts = [f"epoch {row['epoch']:g}/{epochs:g}  step {row['step']}  loss {number(row['loss'])}"]
+        parts.append(f"GCE {number(row['train_gce'])}")
+        if row["val_gce"] is not None:
+            parts.append(f"validation GCE {number(row['val_gce'])}")
+        if row["val_tom_rmse"] is not None:
+            parts.append(f"ToM RMSE {number(row['val_tom_rmse'])}  Other RMSE {number(row['val_other_rmse'])}")
+        if self.done > self.first:
+            rate = (self.done - self.first) / (time.monotonic() - self.started)
+            left = round((self.total - self.done) / rate)
+            parts.append(f"{rate:.2f} groups/s  {left // 3600:d}:{left // 60 % 60:02d}:{left % 60:02d} left")
+        self.say("  ".join(parts))
+
+    def say(self, text: str) -> None:
+        """A line above the bar."""
+        if self.enabled:
+            self.bar.write(text, file=sys.stdout)
+            sys.stdout.flush()
+
+    def close(self) -> None:
+        self.bar.close()

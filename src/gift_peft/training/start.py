@@ -1,0 +1,107 @@
+"""Before the first update: is this run possible, may it write where it is told, and does it go on with another?
+
+Everything that can be known to fail fails here, before a model is loaded.
+"""
+
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+
+from accelerate import Accelerator, PartialState
+from accelerate.utils import ProjectConfiguration
+
+from gift_peft.training.arguments import GiftTrainingArguments
+from gift_peft.training.card import check_push
+from gift_peft.training.checkpoints import find_checkpoint, list_checkpoints, remove_leftovers
+
+RUN_FILES = ("config.yaml", "metrics.jsonl", "adapter", "adapter-last", "logs")
+
+
+def make_accelerator(args: GiftTrainingArguments) -> Accelerator:
+    """Device, processes, mixed precision (the argument, else accelerate's setting, else bf16 on CUDA) and tracker."""
+    on_cuda = PartialState().device.type == "cuda"
+    precision = args.mixed_precision or os.environ.get("ACCELERATE_MIXED_PRECISION") or ("bf16" if on_cuda else "no")
+    if precision not in ("no", "bf16"):
+        raise ValueError(f"mixed_precision: {precision} (accelerate's setting) is not supported; use bf16 or no")
+    if args.report_to != "none" and find_spec(args.report_to) is None:
+        raise ValueError(f"report_to: {args.report_to} is not installed; pip install {args.report_to}")
+    logs = Path(args.output_dir) / "logs"
+    return Accelerator(
+        mixed_precision=precision,
+        log_with=None if args.report_to == "none" else args.report_to,
+        project_config=ProjectConfiguration(project_dir=args.output_dir, logging_dir=str(logs)),
+    )
+
+
+def open_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Path, Path | None]:
+    """(output folder, checkpoint to go on from or None), the folder ready to be written and config.yaml in it.
+
+    Raises ValueError if the folder holds a run that the arguments neither resume nor overwrite.
+    """
+    output = Path(args.output_dir)
+    check_push(args)
+    if output.exists() and not output.is_dir():
+        raise ValueError(f"output_dir: {output} is a file")
+    if accelerator.is_main_process and output.is_dir():
+        remove_leftovers(output)
+    accelerator.wait_for_everyone()
+    checkpoint = None
+    if args.resume_from_checkpoint:
+        warn = print if accelerator.is_main_process else lambda text: None
+        checkpoint = find_checkpoint(output, args.resume_from_checkpoint, warn)
+        if checkpoint is None and (output / "adapter-last").exists():
+            raise ValueError(f"resume_from_checkpoint: the run in {output} has ended and its checkpoints are gone")
+    elif not args.overwrite_output_dir and _holds_run(output):
+        raise ValueError(
+            f"output_dir: {output} already holds a run; --resume_from_checkpoint latest goes on with it, "
+            "--overwrite_output_dir deletes it"
+        )
+    accelerator.wait_for_everyone()  # nobody writes before everybody has looked
+    if accelerator.is_main_process:
+        output.mkdir(parents=True, exist_ok=True)
+        if checkpoint is None:
+            _delete_run(output)
+        (output / "config.yaml").write_text(args.to_yaml(), encoding="utf-8")
+    accelerator.wait_for_everyone()
+    return output, checkpoint
+
+
+def _holds_run(output: Path) -> bool:
+    return any((output / name).exists() for name in RUN_FILES) or bool(list_checkpoints(output))
+
+
+def _delete_run(output: Path) -> None:
+    """What a run writes, and nothing else that may lie in the folder."""
+    for path in [*(output / name for name in RUN_FILES), *list_checkpoints(output)]:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def stop_signals(say: Callable[[str], None]) -> Iterator[SimpleNamespace]:
+    """Inside, SIGINT (Ctrl-C) and SIGTERM (clusters) are noted in `.signum` (else 0); a second SIGINT interrupts."""
+    stop = SimpleNamespace(signum=0)
+
+    def note(signum, frame):
+        if stop.signum and signum == signal.SIGINT:
+            raise KeyboardInterrupt
+        stop.signum = signum
+        say("Stopping after this group; Ctrl-C again stops at once, without a checkpoint")
+
+    if threading.current_thread() is not threading.main_thread():
+        yield stop  # Python delivers signals to the main thread only
+        return
+    before = {signum: signal.signal(signum, note) for signum in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)

@@ -200,9 +200,7 @@ def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.D
         raise ValueError(f"split {split!r}: load one split at a time")
     try:
         if not folder.is_dir():
-            if not re.fullmatch(r"[\w.-]+(/[\w.-]+)?", str(path)) or folder.exists():
-                raise FileNotFoundError(f"dataset {path}: no such folder")
-            return datasets.load_dataset(str(path), split=split, features=FEATURES, revision=revision)
+            return _load_from_hub(str(path), split, revision)
         if prepared := _prepared_splits(folder):
             # Named here, not left to the card: without one, `datasets` guesses splits from words in path names.
             files = {name: f"{name}/**" for name in prepared}
@@ -219,6 +217,16 @@ def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.D
     except datasets.exceptions.DatasetGenerationError as error:
         cause = error.__cause__
         raise (cause if isinstance(cause, ValueError | FileNotFoundError) else error) from None
+
+
+def _load_from_hub(repository: str, split: str, revision: str | None) -> datasets.Dataset:
+    if not re.fullmatch(r"[\w.-]+(/[\w.-]+)?", repository) or Path(repository).exists():
+        raise FileNotFoundError(f"dataset {repository}: no such folder")
+    try:
+        return datasets.load_dataset(repository, split=split, features=FEATURES, revision=revision)
+    except (FileNotFoundError, ConnectionError) as error:
+        reason = str(error).splitlines()[0]
+        raise FileNotFoundError(f"dataset {repository}: no such folder, nor on the hub ({reason})") from None
 
 
 def _check_split(split: str, present, path) -> None:
@@ -254,9 +262,8 @@ def _check_row(table: pa.Table, split: str) -> tuple[list[int], int]:
         count = 0 if files is None else len(files)
         if count != len(names) and (count or column in ("images", "masks")):
             raise ValueError(f"group {group_id}: {len(names)} image names, but a list of {count} {column}")
-        for file in [] if files is None else files.field("path").filter(files.field("bytes").is_null()).to_pylist():
-            if "://" not in file and not os.path.exists(file):
-                raise FileNotFoundError(f"group {group_id}: missing {column.removesuffix('s')} {file}")
+        _check_present(files, f"group {group_id}: missing {column.removesuffix('s')}")
+    _check_present(table["reference"].combine_chunks(), f"group {group_id}: missing reference")
     contents = _contents(table["images"][0].values)
     order = sorted(range(len(names)), key=lambda index: natural_key(names[index]))
     first = {}
@@ -264,6 +271,12 @@ def _check_row(table: pa.Table, split: str) -> tuple[list[int], int]:
         first.setdefault(contents[index], index)
     check_count(group_id, len(first), split, table["reference"][0].is_valid)
     return list(first.values()), len(names)
+
+
+def _check_present(files: pa.StructArray | None, missing: str) -> None:
+    for file in [] if files is None else files.field("path").filter(files.field("bytes").is_null()).to_pylist():
+        if file is not None and "://" not in file and not os.path.exists(file):
+            raise FileNotFoundError(f"{missing} {file}")
 
 
 def _contents(images: pa.StructArray) -> list:

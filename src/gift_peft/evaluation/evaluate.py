@@ -1,0 +1,289 @@
+"""What GIFT did on groups of GIFT-I: the adapted model beside its base, inside the target and outside of it.
+
+Every observation is predicted by the frozen and by the adapted model, aligned to the group's reference (the frozen
+model's prediction on the treated reference, or true depth) and scored per region; GCE (Eq. 7) is the mean over groups.
+The consensus is the base with its target replaced by the group's per-pixel median: what Eq. 3 pulls towards.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from gift_peft.data.gift_i import load_gift_i
+from gift_peft.data.preprocess import Group, collate_group, resolve_size
+from gift_peft.evaluation.predict import load_model, predict_depth, prediction_kind
+from gift_peft.evaluation.protocols import Protocol, get_protocol
+from gift_peft.evaluation.report import Panel, markdown_table, text_table
+from gift_peft.evaluation.results import (
+    GiftIReport,
+    by_surface,
+    count_rows,
+    detect_collapse,
+    summarize,
+    summarize_gce,
+    write_text,
+)
+from gift_peft.evaluation.scoring import NO_DEPTH, Predictor, Task, evaluate_group, references, resize_prediction
+
+REFERENCES = {"proxy": "native", "depth": "gift"}  # and the protocol that goes with each
+
+
+def evaluate_gift_i(
+    dataset: Any,
+    model: Any = None,
+    teacher: Any = None,
+    protocol: str | Protocol | None = None,
+    reference: str = "proxy",
+    *,
+    processor: Any = None,
+    size: tuple[int, int] | None = None,
+    kind: str | None = None,
+    baseline: bool = True,
+    accelerator: Any = None,
+    batch_size: int = 2,
+    progress: bool = True,
+) -> GiftIReport:
+    """Evaluates a model on groups, beside its base.
+
+    A row of the result: `group_id`, `image`, `surface`, `skipped` (None or why), `target_pixels`, and for each of
+    `base`, `adapted`, `consensus`: `target_mean` and `spread` (P95-P5) of the prediction in native units, `scale`,
+    `shift`, `num_clipped`, `num_nonpositive` of its alignment, and the metrics of `all`, `tom` and `other`.
+
+    Args:
+        dataset: rows of `load_gift_i`, or ready `Group`s, read by index; or a path or hub id, of which the validation
+            split is taken. Proxies attached to it give the treated reference's target; without them the frozen model
+            predicts it here, which comes to the same.
+        model: a `PeftModel`, whose base is reached by `disable_adapter()`; a model or a callable
+            (B,3,h,w) -> (B,H,W) beside a `teacher`; or the base alone, to see where it stands.
+        teacher: the frozen model or callable, or its folder or hub id, where `model` is not a `PeftModel`.
+        protocol (`str` or `Protocol`, *optional*): default `native` against proxies, `gift` against depth.
+        reference (`str`): `proxy`, or `depth`: the true z-depth of `depths`, on its own grid (predictions are resized
+            bilinearly).
+        processor, size: of the images; default those of the model (the size of the proxies if there are any).
+        kind (`str`, *optional*): `depth` or `inverse_depth`; default the recipe's.
+        baseline (`bool`): False leaves out the base, the consensus and the collapse check (to validate in training).
+        accelerator (`accelerate.Accelerator`, *optional*): spreads the groups over its processes; every process gets
+            the whole report.
+        batch_size (`int`): the cut of a group, in image order, as the teacher's.
+
+    Raises:
+        ValueError: a non-finite prediction (naming group and image), a prediction of another size than the image,
+            an unknown reference, kind or protocol, a dataset without the reference asked for.
+    """
+    if reference not in REFERENCES:
+        raise ValueError(f"unknown reference {reference!r}: choose one of {', '.join(REFERENCES)}")
+    if model is None:
+        raise ValueError("evaluate_gift_i needs a model")
+    if isinstance(dataset, str | Path):
+        dataset = load_gift_i(dataset, "validation")
+    rules = get_protocol(protocol or REFERENCES[reference])
+    if kind is None:
+        # In `native` nothing is ever inverted, so a callable without a recipe need not say what it predicts.
+        kind = "depth" if rules.space == "native" else prediction_kind(model)
+    predictors, frozen = _predictors(model, teacher, baseline, batch_size)
+    models = [*predictors, *(["consensus"] if "base" in predictors else [])]
+    task = Task(predictors, frozen, models, rules, reference, kind)
+
+    rank, world = (accelerator.process_index, accelerator.num_processes) if accelerator else (0, 1)
+    prepare = _collator(dataset, model, processor, size)
+    results = []
+    with _evaluating(model, teacher):
+        for index in tqdm(
+            range(rank, len(dataset), world),
+            desc="evaluate",
+            unit="group",
+            disable=None if progress and rank == 0 else True,
+        ):
+            results.append((index, *evaluate_group(dataset[index], prepare, task)))
+    if world > 1:
+        from accelerate.utils import gather_object
+
+        results = gather_object(results)
+    results.sort(key=lambda result: result[0])
+    groups = [group for _, group, _ in results]
+    rows = [row for _, _, own in results for row in own]
+    if not rows:
+        raise ValueError("the dataset has no groups to evaluate")
+    if reference == "depth" and all(row["skipped"] == NO_DEPTH for row in rows):
+        raise ValueError('no group of the dataset has true depth; evaluate against the proxies (reference="proxy")')
+    return _report(groups, rows, task)
+
+
+def run_evaluation(
+    base: str,
+    dataset: str,
+    adapter: str | None = None,
+    *,
+    reference: str = "proxy",
+    protocol: str | None = None,
+    split: str = "validation",
+    out: str | Path = "evaluation",
+    adapter_scale: float | None = None,
+    size: tuple[int, int] | None = None,
+    kind: str | None = None,
+    revision: str | None = None,
+    dataset_revision: str | None = None,
+    batch_size: int = 2,
+    device: str | None = None,
+    color: bool = False,
+    progress: bool = True,
+) -> GiftIReport:
+    """`gift-peft evaluate`: loads, evaluates, prints the table, writes `metrics.json`, `rows.jsonl`, `report.md`."""
+    loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
+    groups = load_gift_i(dataset, split, revision=dataset_revision)
+    report = evaluate_gift_i(
+        groups,
+        loaded.model,
+        protocol=protocol,
+        reference=reference,
+        processor=loaded.processor,
+        size=loaded.size,
+        kind=kind or loaded.kind,
+        batch_size=batch_size,
+        progress=progress,
+    )
+    report.about = {
+        "base": base,
+        "revision": revision,
+        "adapter": adapter,
+        "adapter_scale": adapter_scale,
+        "dataset": str(dataset),
+        "split": split,
+        "size": list(loaded.size),
+    }
+    folder = report.save(out)
+    write_text(folder / "report.md", markdown_table(report))
+    print(text_table(report, color=color))
+    print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
+    return report
+
+
+def make_panel(
+    row: dict,
+    index: int,
+    model: Any,
+    teacher: Any = None,
+    *,
+    label: str,
+    processor: Any = None,
+    size: tuple[int, int] | None = None,
+    kind: str | None = None,
+    reference: str = "depth",
+    batch_size: int = 2,
+) -> Panel:
+    """One observation of a group as a row of `before_after`; arguments as in `evaluate_gift_i`.
+
+    Raises:
+        ValueError: the group has no such reference.
+    """
+    kind = kind or prediction_kind(model)
+    predictors, frozen = _predictors(model, teacher, True, batch_size)
+    task = Task(predictors, frozen, [], get_protocol(REFERENCES[reference]), reference, kind)
+    group = _collator([row], model, processor, size)(row)
+    with _evaluating(model, teacher):
+        targets, masks, _ = references(row, group, task)
+        if targets[index] is None:
+            raise ValueError(f"group {group.group_id} has no {reference} to compare with")
+        shape = targets[index].shape
+        base, adapted = (
+            resize_prediction(predictors[name](group.pixel_values)[index], shape) for name in ("base", "adapted")
+        )
+    return Panel(label, row["images"][index], targets[index], base, adapted, masks[index], kind, task.protocol.name)
+
+
+# ---- the models ----
+
+
+def _predictors(model, teacher, baseline: bool, batch_size: int) -> tuple[dict[str, Predictor], Predictor]:
+    """The predictors to compare, and the frozen one."""
+
+    def plain(network):
+        return lambda pixel_values: predict_depth(network, pixel_values, batch_size)
+
+    own = plain(model)
+    if hasattr(model, "disable_adapter"):
+
+        def frozen(pixel_values):
+            with model.disable_adapter():
+                return own(pixel_values)
+
+    elif teacher is not None:
+        frozen = plain(load_model(teacher).model if isinstance(teacher, str | Path) else teacher)
+    else:
+        return {"base": own}, own
+    return ({"base": frozen, "adapted": own} if baseline else {"adapted": own}), frozen
+
+
+@contextmanager
+def _evaluating(*models: Any) -> Iterator[None]:
+    """Eval mode inside; afterwards every module's mode and every parameter's requires_grad are as before.
+
+    (`disable_adapter()` turns gradients on for every adapter parameter when it ends, frozen ones included.)
+    """
+    networks = [model for model in models if isinstance(model, torch.nn.Module)]
+    modes = [(module, module.training) for network in networks for module in network.modules()]
+    gradients = [(weight, weight.requires_grad) for network in networks for weight in network.parameters()]
+    for network in networks:
+        network.eval()
+    try:
+        yield
+    finally:
+        for module, mode in modes:
+            module.training = mode
+        for weight, flag in gradients:
+            weight.requires_grad_(flag)
+
+
+def _collator(dataset, model, processor, size) -> Callable[[dict], Group]:
+    """Rows to groups, at the size of the stored proxies where there are any."""
+    first = dataset[0] if len(dataset) else None
+    if first is None or isinstance(first, Group):
+        return lambda group: group
+    if processor is None:
+        from transformers import AutoImageProcessor
+
+        config = getattr(model, "config", None)
+        source = getattr(config, "_name_or_path", "")
+        if not source:
+            raise ValueError("evaluate_gift_i: the model does not say where it came from; pass its processor=")
+        processor = AutoImageProcessor.from_pretrained(source)
+    for name in ("proxies", "reference_proxy"):
+        if size is None and first.get(name) is not None:
+            size = np.asarray(first[name]).shape[-2:]
+    if size is None:
+        size = resolve_size(None, _recipe(model), processor)
+    return lambda row: collate_group(row, processor, tuple(size))
+
+
+def _recipe(model):
+    from gift_peft.adapters import get_recipe
+
+    try:
+        return get_recipe(model)
+    except ValueError:
+        return None  # an architecture without a recipe: its image processor states the size
+
+
+def _report(groups: list[dict], rows: list[dict], task: Task) -> GiftIReport:
+    subject = "adapted" if "adapted" in task.models else "base"
+    compared = {"base", "adapted"} <= set(task.models)
+    return GiftIReport(
+        summary=summarize(rows, subject),
+        base=summarize(rows, "base") if "base" in task.models else None,
+        consensus=summarize(rows, "consensus") if "consensus" in task.models else None,
+        gce=summarize_gce(groups, task.models),
+        collapse=detect_collapse(rows) if compared else None,
+        by_surface=by_surface(rows, task.models, subject),
+        counts=count_rows(rows, len(groups)),
+        protocol=task.protocol.to_dict() | {"description": task.protocol.describe()},
+        reference=task.reference,
+        adapted=subject == "adapted",
+        unit="native units" if task.reference == "proxy" else "mm",
+        groups=groups,
+        rows=rows,
+    )

@@ -1,0 +1,269 @@
+"""Loading a base with its adapter, and depth for single pictures (`gift-peft predict`).
+
+Pictures are resized as in training and the prediction is brought back to each picture's own size with the bicubic
+interpolation of transformers' `post_process_depth_estimation`. Values stay in the network's native units.
+"""
+
+import json
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image
+from tqdm import tqdm
+
+from gift_peft.data.preprocess import is_image_file, read_image, resolve_size, to_pixel_values
+from gift_peft.data.proxies import teacher_revision
+from gift_peft.data.raw import natural_key
+from gift_peft.evaluation.colormap import color_range, colorize
+
+
+class LoadedModel(NamedTuple):
+    """A model ready to predict: eval mode, float32, on its device.
+
+    Args:
+        model (`transformers.PreTrainedModel` or `peft.PeftModel`): the base, or the base under its adapter.
+        processor: the image processor, the adapter's where it brings one.
+        size (`tuple[int, int]`): (height, width) at the network.
+        kind (`str`, *optional*): `depth` or `inverse_depth`; None for an architecture without a recipe.
+    """
+
+    model: Any
+    processor: Any
+    size: tuple[int, int]
+    kind: str | None
+
+
+def load_model(
+    base: str | Path,
+    adapter: str | Path | None = None,
+    adapter_scale: float | None = None,
+    revision: str | None = None,
+    size: str | tuple[int, int] | None = None,
+    device: str | torch.device | None = None,
+) -> LoadedModel:
+    """A base model, with an adapter if one is named.
+
+    Args:
+        base: folder or hub id.
+        adapter (*optional*): folder or hub id in PEFT format.
+        adapter_scale (`float`, *optional*): 0 is the base, 1 the adapter, to the bit.
+        revision (`str`, *optional*): of the base.
+        size (*optional*): (height, width) or "HxW"; default the adapter's training size, else the recipe's, else the
+            image processor's.
+        device (*optional*): default CUDA where there is one.
+
+    Raises:
+        FileNotFoundError: no model or adapter at that place.
+        ValueError: the adapter was made for another base, or no size is known.
+    """
+    from transformers import AutoImageProcessor, AutoModelForDepthEstimation
+
+    from gift_peft.adapters import get_recipe, set_adapter_scale
+
+    try:
+        model = AutoModelForDepthEstimation.from_pretrained(base, revision=revision, dtype=torch.float32)
+        processor = AutoImageProcessor.from_pretrained(base, revision=revision, backend="pil")
+    except OSError as error:
+        raise FileNotFoundError(f"base model {base}: {_first_line(error)}") from None
+    config = model.config
+    try:
+        recipe = get_recipe(model)
+    except ValueError:
+        recipe = None  # an architecture without a recipe still predicts; its kind has to be told where it matters
+    if adapter is not None:
+        model, processor = _attach(model, processor, base, adapter, revision)
+        if adapter_scale is not None:
+            set_adapter_scale(model, adapter_scale)
+        stated = getattr(processor, "size", None) or {}
+        if size is None and "height" in stated and "width" in stated:
+            size = stated["height"], stated["width"]
+    elif adapter_scale is not None:
+        raise ValueError("adapter_scale needs an adapter")
+    size = resolve_size(size, recipe, processor, config)
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    return LoadedModel(model.to(device).eval(), processor, size, recipe and recipe.kind_for(config))
+
+
+def predict_depth(model: Any, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
+    """(N,3,h,w) images to (N,h,w) float32 on the CPU: micro-batches in image order, no gradients, no autocast.
+
+    `model` is called with `pixel_values=` if it is a module (`.predicted_depth` or a tensor comes back), else as a
+    plain function of the tensor.
+    """
+    is_module = isinstance(model, torch.nn.Module)
+    weight = next(model.parameters(), None) if is_module else None
+    device = torch.device("cpu") if weight is None else weight.device
+    depths = []
+    with torch.no_grad(), torch.autocast(device.type, enabled=False):
+        for batch in pixel_values.split(batch_size):
+            output = model(pixel_values=batch.to(device)) if is_module else model(batch)
+            depths.append(getattr(output, "predicted_depth", output).float().cpu())
+    return torch.cat(depths)
+
+
+def prediction_kind(model: Any) -> str:
+    """`depth` or `inverse_depth`, as the model's recipe says; ValueError where there is none to ask."""
+    from gift_peft.adapters import get_recipe
+
+    config = getattr(model, "config", None)
+    if config is None:
+        raise ValueError('say what the model predicts: kind="depth" or kind="inverse_depth"')
+    return get_recipe(model).kind_for(config)
+
+
+def predict_images(
+    images: Sequence[str | Path],
+    base: str | Path,
+    adapter: str | Path | None = None,
+    adapter_scale: float | None = None,
+    *,
+    out: str | Path,
+    size: str | tuple[int, int] | None = None,
+    kind: str | None = None,
+    revision: str | None = None,
+    device: str | torch.device | None = None,
+    progress: bool = True,
+) -> list[Path]:
+    """Writes `<stem>.npy` and `<stem>.png` per picture and, with an adapter, `<stem>_base.npy/.png` beside them.
+
+    The npy is (H,W) float32 at the picture's own size, in the model's native units: relative inverse depth for a
+    relative Depth Anything (large is near), depth for metric models. The two PNGs of a picture share one colour range;
+    near is bright. Pictures of one stem become `<stem>-2` and so on.
+
+    Args:
+        images: files, or folders whose pictures are taken.
+        base, adapter, adapter_scale, revision, size, device: as in `load_model`.
+        out: folder; made if missing, existing files of these names are replaced.
+        kind (`str`, *optional*): decides which end is bright; default the recipe's.
+
+    Returns:
+        `list[Path]`: the npy file of each picture.
+
+    Raises:
+        FileNotFoundError: a picture, base or adapter that is not there. ValueError: an unreadable picture, a
+            non-finite prediction, an adapter for another base.
+    """
+    files = _list_images(images)
+    names = _unique_names(files, beside=adapter is not None)
+    loaded = load_model(base, adapter, adapter_scale, revision, size, device)
+    kind = kind or loaded.kind
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, name in tqdm(
+        list(zip(files, names, strict=True)), desc="predict", unit="image", disable=None if progress else True
+    ):
+        image = read_image(file)
+        pixel_values = to_pixel_values([image], loaded.processor, loaded.size)
+        depths = {name: _at_image_size(predict_depth(loaded.model, pixel_values), image, file)}
+        if adapter is not None:
+            with loaded.model.disable_adapter():
+                depths[f"{name}_base"] = _at_image_size(predict_depth(loaded.model, pixel_values), image, file)
+        low, high = color_range(*depths.values())
+        for stem, depth in depths.items():
+            np.save(folder / f"{stem}.npy", depth)
+            Image.fromarray(colorize(depth, low, high, kind or "inverse_depth")).save(folder / f"{stem}.png")
+    return [folder / f"{name}.npy" for name in names]
+
+
+def _at_image_size(depth: torch.Tensor, image: Image.Image, file: Path) -> np.ndarray:
+    """(1,h,w) to the picture's (H,W) as transformers does it; ValueError for NaN and infinity."""
+    if not torch.isfinite(depth).all():
+        raise ValueError(f"{file}: the prediction has NaN or infinite values")
+    size = (image.height, image.width)
+    return torch.nn.functional.interpolate(depth[None], size=size, mode="bicubic", align_corners=False)[0, 0].numpy()
+
+
+def _list_images(images: Sequence[str | Path]) -> list[Path]:
+    files: list[Path] = []
+    for path in map(Path, images):
+        files += _pictures_in(path) if path.is_dir() else [path]
+    missing = [str(path) for path in files if not path.is_file()]
+    if missing:
+        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+        raise FileNotFoundError(f"no such image: {missing[0]}{more}")
+    if not files:
+        raise ValueError(f"no images in {', '.join(map(str, images)) or 'an empty list'}")
+    return files
+
+
+def _pictures_in(folder: Path) -> list[Path]:
+    return sorted(filter(is_image_file, folder.iterdir()), key=lambda path: natural_key(path.name))
+
+
+def _unique_names(files: Sequence[Path], beside: bool) -> list[str]:
+    """A file name per picture; `beside` keeps `<name>_base` free as well."""
+    taken: set[str] = set()
+    names = []
+    for file in files:
+        number, name = 1, file.stem
+        while {name, f"{name}_base"} & taken if beside else name in taken:
+            number += 1
+            name = f"{file.stem}-{number}"
+        taken |= {name, f"{name}_base"} if beside else {name}
+        names.append(name)
+    return names
+
+
+# ---- adapters ----
+
+
+def _attach(model, processor, base, adapter, revision):
+    """The PeftModel and its image processor; one clear error if the adapter belongs to another base."""
+    from peft import PeftConfig, PeftModel
+    from transformers import AutoImageProcessor
+
+    if Path(adapter).is_dir() and not (Path(adapter) / "adapter_config.json").is_file():
+        raise FileNotFoundError(f"adapter {adapter}: the folder has no adapter_config.json")
+    try:
+        made_for = PeftConfig.from_pretrained(adapter).base_model_name_or_path
+    except (OSError, ValueError) as error:
+        raise FileNotFoundError(
+            f"adapter {adapter}: no such folder, and not on the hub ({_first_line(error)})"
+        ) from None
+    _check_base(base, revision, adapter, made_for)
+    mismatch = f"adapter {adapter} does not fit base {base}: it was trained on {made_for}"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            model = PeftModel.from_pretrained(model, adapter)
+        except (RuntimeError, ValueError, KeyError) as error:
+            raise ValueError(f"{mismatch} ({_first_line(error)})") from None
+    for warning in caught:
+        if "missing adapter keys" in str(warning.message):
+            raise ValueError(f"{mismatch} (weights are missing in it)")
+        warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    with suppress(OSError, ValueError):  # an adapter that PEFT alone saved: the base's processor serves
+        processor = AutoImageProcessor.from_pretrained(adapter, backend="pil")
+    return model, processor
+
+
+def _check_base(base, revision, adapter, made_for: str | None) -> None:
+    """ValueError unless the adapter was trained on this base, as far as names and weights tell.
+
+    The digest in gift.json finds a folder of the same name with other weights, and knows a moved one again.
+    """
+    pinned = _read_gift(adapter).get("base_revision") or ""
+    present = teacher_revision(base, revision)
+    comparable = pinned.startswith("sha256:") == present.startswith("sha256:") and pinned
+    if comparable and pinned.startswith("sha256:"):
+        if pinned != present:
+            raise ValueError(
+                f"adapter {adapter} was trained on {made_for}, whose weights or configuration are not those of {base}"
+            )
+    elif made_for and str(base) != made_for and not Path(base).exists() and not Path(made_for).exists():
+        raise ValueError(f"adapter {adapter} was trained on {made_for}, not on {base}")
+
+
+def _read_gift(adapter) -> dict:
+    """The adapter's gift.json; empty without one (an adapter that PEFT alone saved)."""
+    path = Path(adapter) / "gift.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -1,0 +1,166 @@
+"""What an evaluation leaves behind: per-image rows, their means per region, GCE, the collapse alarm, and the files.
+
+Summaries are means over images (NaN left out and counted), so they do not depend on the order of the rows.
+"""
+
+import json
+import math
+import os
+from collections import Counter
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gift_peft.evaluation.metrics import METRICS
+
+REGIONS = ("tom", "other", "all")
+COLLAPSE_RANGE = (0.5, 2.0)
+
+
+@dataclass
+class GiftIReport:
+    """The result of `evaluate_gift_i`.
+
+    Args:
+        summary (`dict`): {region: {metric: mean over images}} of the evaluated model.
+        base (`dict`, *optional*): the same of the frozen model.
+        consensus (`dict`, *optional*): the same of the base with the target replaced by the group median.
+        gce (`dict`): `base`, `adapted`, `base_normalized`, `adapted_normalized` (None where that model was not run),
+            `num_groups`, `num_skipped`.
+        collapse (`dict`, *optional*): adapted/base ratios `target_mean_ratio` and `spread_ratio`, and `alarm`.
+        by_surface (`dict`): {surface: {`num_images`, `summary`, `base`, `consensus`}}.
+        counts (`dict`): `groups`, `images`, `scored`, `skipped`, `reasons` ({reason: images}), `without_tom`.
+        protocol (`dict`): the protocol's choices; `description` is the line under every table.
+        reference (`str`): `proxy` or `depth`.
+        adapted (`bool`): whether `summary` is of an adapted model, or of the base itself.
+        unit (`str`): of MAE and RMSE.
+        groups (`list[dict]`): GCE per group.
+        rows (`list[dict]`): one per observation, see `evaluate_gift_i`.
+        about (`dict`): what was evaluated (base, adapter, dataset, ...), where the caller knows.
+    """
+
+    summary: dict
+    base: dict | None
+    consensus: dict | None
+    gce: dict
+    collapse: dict | None
+    by_surface: dict
+    counts: dict
+    protocol: dict
+    reference: str
+    adapted: bool
+    unit: str
+    groups: list[dict]
+    rows: list[dict] = field(repr=False)
+    about: dict = field(default_factory=dict)
+
+    def to_dict(self) -> dict:
+        """Everything but the rows, in JSON types; NaN and infinity become None."""
+        return jsonable({item.name: getattr(self, item.name) for item in fields(self) if item.name != "rows"})
+
+    def save(self, folder: str | Path) -> Path:
+        """Writes `metrics.json` and `rows.jsonl`, each at once or not at all; returns the folder."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(folder / "rows.jsonl", "".join(json.dumps(jsonable(row)) + "\n" for row in self.rows))
+        write_text(folder / "metrics.json", json.dumps(self.to_dict(), indent=2) + "\n")
+        return folder
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "GiftIReport":
+        """A saved report; FileNotFoundError if the folder holds none."""
+        folder = Path(folder)
+        for name in ("metrics.json", "rows.jsonl"):
+            if not (folder / name).is_file():
+                raise FileNotFoundError(f"no evaluation in {folder}: {name} is missing; run gift-peft evaluate --out")
+        rows = [json.loads(line) for line in (folder / "rows.jsonl").read_text(encoding="utf-8").splitlines()]
+        return cls(rows=rows, **json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Atomic: a reader sees the old file or the new one."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def jsonable(value: Any) -> Any:
+    """Nested JSON types; numbers that JSON cannot hold (NaN, infinity) become None."""
+    if isinstance(value, dict):
+        return {key: jsonable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def mean(values: list[float]) -> float:
+    """Mean of the values that are not NaN; NaN if none is."""
+    values = [value for value in values if not math.isnan(value)]
+    return math.fsum(values) / len(values) if values else math.nan
+
+
+def summarize(rows: list[dict], model: str) -> dict:
+    """{region: {metric: mean over images}} of one of `base`, `adapted`, `consensus`."""
+    return {
+        region: {metric: mean([row[model][region][metric] for row in rows]) for metric in METRICS}
+        for region in REGIONS
+    }
+
+
+def summarize_gce(groups: list[dict], models: list[str]) -> dict:
+    """Eq. 7 over the groups of rows `groups`, for every model that was run."""
+    counted = [group for group in groups if group["counted"]]
+    gce: dict[str, Any] = {}
+    for suffix in ("", "_normalized"):
+        for model in ("base", "adapted"):
+            values = [group[f"gce_{model}{suffix}"] for group in counted] if model in models else None
+            gce[model + suffix] = None if values is None else mean(values)
+    return gce | {"num_groups": len(counted), "num_skipped": len(groups) - len(counted)}
+
+
+def detect_collapse(rows: list[dict]) -> dict:
+    """Did the adapted outputs shrink, grow or flatten? A ratio outside [0.5, 2], or undefined, raises the alarm."""
+    target_mean, spread = (
+        [[row[model][name] for row in rows if not math.isnan(row[model][name])] for model in ("adapted", "base")]
+        for name in ("target_mean", "spread")
+    )
+    ratios = {
+        "target_mean_ratio": _ratio(*map(mean, target_mean)),
+        "spread_ratio": _ratio(*(float(np.median(values)) if values else math.nan for values in spread)),
+    }
+    low, high = COLLAPSE_RANGE
+    return ratios | {"alarm": any(not low <= ratio <= high for ratio in ratios.values())}
+
+
+def _ratio(adapted: float, base: float) -> float:
+    return adapted / base if base else math.nan
+
+
+def count_rows(rows: list[dict], num_groups: int) -> dict:
+    """How many images the means are over, and why others are not in them."""
+    reasons = Counter(row["skipped"] for row in rows if row["skipped"])
+    skipped = sum(reasons.values())
+    return {
+        "groups": num_groups,
+        "images": len(rows),
+        "scored": len(rows) - skipped,
+        "skipped": skipped,
+        "reasons": dict(sorted(reasons.items())),
+        "without_tom": sum(not row["skipped"] and not row["target_pixels"] for row in rows),
+    }
+
+
+def by_surface(rows: list[dict], models: list[str], subject: str) -> dict:
+    """The summaries per surface kind, `unknown` where the group states none."""
+    surfaces = sorted({row["surface"] or "unknown" for row in rows})
+    result = {}
+    for surface in surfaces:
+        own = [row for row in rows if (row["surface"] or "unknown") == surface]
+        result[surface] = {"num_images": sum(not row["skipped"] for row in own), "summary": summarize(own, subject)}
+        for model in ("base", "consensus"):
+            result[surface][model] = summarize(own, model) if model in models else None
+    return result

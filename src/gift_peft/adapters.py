@@ -7,7 +7,6 @@ result is a plain `PeftModel`: `disable_adapter()` is the frozen teacher, to the
 from __future__ import annotations
 
 import copy
-import hashlib
 import json
 import math
 import re
@@ -20,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict
+from peft import LoraConfig, PeftModel, get_peft_model
 from peft.tuners.lora import LoraLayer
 from peft.utils.other import ModulesToSaveWrapper
-from safetensors import safe_open
 from torch import nn
 
 from gift_peft.group_step import dropout_rates
@@ -266,8 +264,8 @@ def save_adapter(
     """Write an adapter folder in PEFT's format; it replaces an earlier one as a whole, or not at all.
 
     Args: `base_model_name_or_path`, `revision` of the base (default: where the model was loaded from); `processor` an
-    image processor, written with `size` (height, width); `gift` what `gift.json` says besides versions and a digest of
-    the base (NaN becomes null); `card` the finished README.md. A local base path is warned about: others cannot load
+    image processor, written with `size` (height, width); `gift` what `gift.json` says besides versions and size (NaN
+    becomes null); `card` the finished README.md. A local base path is warned about: others cannot load
     the adapter by name; it stays out of the card.
     Raises ValueError if an adapter scale other than 1 is set, if `folder` holds other files, and if the card names an
     absolute base path.
@@ -294,58 +292,12 @@ def save_adapter(
         _write_json(temporary / ADAPTER_CONFIG, config)
         if processor is not None:
             _at_size(processor, size).save_pretrained(temporary)
-        _write_json(temporary / "gift.json", _gift_json(model, gift, size))
+        _write_json(temporary / "gift.json", _gift_json(gift, size))
         # Last: PEFT writes a README of its own, which names a local base path.
         (temporary / "README.md").write_text(card or _minimal_card(hub_base), encoding="utf-8")
         _replace_folder(temporary, folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def load_adapter(model: nn.Module, folder: str | Path, is_trainable: bool = False) -> PeftModel:
-    """`PeftModel.from_pretrained(model, folder).eval()` that refuses an adapter made for another base.
-
-    Raises FileNotFoundError if a local folder holds no adapter, ValueError if names, shapes or, by the digest in
-    `gift.json`, the base's weights differ from those it was trained on, or if its options break `disable_adapter()`.
-    """
-    folder = Path(folder)
-    if not (folder / ADAPTER_CONFIG).is_file():
-        raise FileNotFoundError(f"{folder} is not an adapter folder: it has no {ADAPTER_CONFIG}")
-    config = json.loads((folder / ADAPTER_CONFIG).read_text())
-    misfit = f"the adapter {folder} does not fit this base: it was trained on {config.get('base_model_name_or_path')}"
-    gift = folder / "gift.json"
-    digest = json.loads(gift.read_text()).get("base_digest") if gift.is_file() else None
-    if digest is not None and next(model.parameters()).dtype == torch.float32 and digest != base_digest(model):
-        raise ValueError(f"{misfit}, whose weights differ")
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Found missing adapter keys")  # an error just below
-            adapted = PeftModel.from_pretrained(model, folder, is_trainable=is_trainable).eval()
-    except (RuntimeError, ValueError, KeyError) as error:
-        raise ValueError(f"{misfit} ({str(error).splitlines()[0][:200]})") from error
-    with safe_open(folder / "adapter_model.safetensors", "pt") as file:
-        if set(file.keys()) != get_peft_model_state_dict(adapted, save_embedding_layers=False).keys():
-            raise ValueError(f"{misfit}, whose layers have other names")
-    check_lora_config(adapted.peft_config["default"])
-    return adapted
-
-
-def base_digest(model: nn.Module) -> str:
-    """A digest of the base's weights, the same with and without an adapter around them.
-
-    Names, shapes and at most 256 evenly spaced values of every parameter: milliseconds for a large model.
-    """
-    base = {}
-    for name, parameter in model.named_parameters():
-        if ".lora_" in name or ".modules_to_save." in name:
-            continue
-        base[re.sub(r"^base_model\.model\.|\.base_layer|\.original_module", "", name)] = parameter
-    digest = hashlib.sha256()
-    for name, parameter in sorted(base.items()):
-        values = parameter.detach().flatten()
-        values = values[:: max(1, -(-values.numel() // 256))].to("cpu", torch.float32)
-        digest.update(f"{name} {tuple(parameter.shape)} ".encode() + values.numpy().tobytes())
-    return digest.hexdigest()[:32]
 
 
 def _full_scaling(layer: LoraLayer, name: str) -> float:
@@ -406,12 +358,11 @@ def _at_size(processor: Any, size: tuple[int, int] | None) -> Any:
     return processor
 
 
-def _gift_json(model: PeftModel, gift: Mapping[str, Any] | None, size: tuple[int, int] | None) -> dict[str, Any]:
+def _gift_json(gift: Mapping[str, Any] | None, size: tuple[int, int] | None) -> dict[str, Any]:
     packages = ("gift-peft", "torch", "transformers", "peft", "accelerate")
     return {
         "versions": {name: version(name) for name in packages},
         "size": size,
-        "base_digest": base_digest(model),
         **(gift or {}),
     }
 

@@ -1,0 +1,269 @@
+"""Render the groups of the mini GIFT-I: one camera, one geometry, and a target whose content changes.
+
+    python examples/embedded/render_groups.py --out renders/groups --processes 2
+
+A mirror reflects a room that is rearranged behind the camera, or has a sheet hung before it; a pane stands before
+things that are moved, or has a card touching its back; a glass object shows what is behind it, or is filled or lined.
+In about two thirds of the observations the surface itself can be seen. Per group: `images/*.jpg` (quality 95),
+`masks/*.png` (the target's visible pixels), `depths/*.png` (z-depth in mm, exact, the target's surface included),
+`reference.jpg` (the same scene with a matte target) and `group.json`. Finished groups are skipped.
+"""
+
+import argparse
+import json
+import os
+import shutil
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rooms
+import targets
+import textures
+from PIL import Image
+from tqdm import tqdm
+
+KINDS = {"mirror": "mirror", "pane": "transparent", "solid": "transparent"}
+SPLITS = {"train": {"mirror": 28, "pane": 26, "solid": 26}, "validation": {"mirror": 8, "pane": 8, "solid": 8}}
+FIRST_SEED = {"train": 0, "validation": 500_000}
+
+
+def clutter(rng, count, x_range, y_range) -> list[rooms.Item]:
+    """Things that somebody carries into the room for one observation."""
+    items = []
+    for _ in range(count):
+        x, y = rng.uniform(*x_range), rng.uniform(*y_range)
+        if rng.random() < 0.4:
+            size = rng.uniform((0.2, 0.15, 0.4), (0.7, 0.5, 1.8))
+            items.append(rooms.box((x, y, size[2] / 2), size, rooms.twin_texture(rng), rng.uniform(-0.8, 0.8)))
+        else:
+            items += rooms.furniture(rng, x, y)
+    return items
+
+
+def sheet(rng, flat: targets.Flat, offset: float) -> list[rooms.Item]:
+    """Paper or card on the target's plane, `offset` metres towards the camera; mostly over all of it."""
+    u, v, centre = flat.u, flat.v, flat.centre + flat.normal * offset
+    if rng.random() < 0.3:
+        share = rng.uniform(0.6, 0.9)
+        centre = centre + rng.choice([-1, 1]) * (1 - share) * u
+        u = u * share
+    return [rooms.quad(centre, u, v, textures.card(rng))]
+
+
+def smudges(rng, scene, flat: targets.Flat) -> np.ndarray:
+    """(H, W) dust and wiping marks in the plane of a mirror or pane, 0 to 1."""
+    import tracer
+
+    direction = tracer.rays(scene.camera)
+    distance = ((flat.centre - scene.camera.origin) @ flat.normal) / (direction @ flat.normal)
+    point = scene.camera.origin + direction * distance[..., None] - flat.centre
+    s = (point @ flat.u / (flat.u @ flat.u) + 1) / 2
+    t = (point @ flat.v / (flat.v @ flat.v) + 1) / 2
+    dirt = textures.mottled(rng, np.full(3, 0.5, np.float32), 0.9)[..., 0]
+    dirt = cv2.GaussianBlur(dirt, (0, 0), 6, sigmaY=1.2)
+    side = textures.SIDE - 1
+    return cv2.remap(dirt, (s * side).astype(np.float32), (t * side).astype(np.float32), cv2.INTER_LINEAR)
+
+
+def fresnel(scene, flat: targets.Flat) -> np.ndarray:
+    """(H, W) reflectance of both faces of a pane of index 1.5 (Schlick)."""
+    import tracer
+
+    cosine = np.abs(tracer.rays(scene.camera) @ flat.normal)
+    face = 0.04 + 0.96 * (1 - cosine) ** 5
+    return 2 * face / (1 + face)
+
+
+def plan(rng, kind: str):
+    """A furnished room around one target, the camera turned to it."""
+    scene = rooms.make_room(rng, (2.4, 4.6))
+    if kind == "mirror":
+        place = targets.wall_panel if rng.random() < 0.6 else lambda r, s: targets.standing_panel(r, s, False)
+        target = place(rng, scene)
+    elif kind == "pane":
+        target = targets.standing_panel(rng, scene, True)
+        if target is not None and len(target.holder) == 2:  # frameless: the cut edge of the glass is green
+            rim = targets.border(rng, target.centre, target.u, target.v, 0.014, 0.012)
+            tone = np.array([0.06, 0.16, 0.1], np.float32) * rng.uniform(0.6, 1.8)
+            target.holder += [rooms.Item(bar.shape, tone, bar.points) for bar in rim]
+    else:
+        target = targets.table_object(rng, scene)
+    if target is None:
+        return None
+    if kind != "solid" and (target.centre - scene.camera.origin) @ target.normal > -0.5:
+        return None  # edge on, or seen from behind
+    targets.aim(rng, scene, target.centre)
+    clear = [target.centre[:2]]
+    if kind != "solid":
+        clear += [(target.centre + sign * target.u)[:2] for sign in (-0.8, 0.8)]
+    scene.items += target.holder
+    rooms.furnish(rng, scene, keep_clear=[tuple(c) for c in clear])
+    return scene, target
+
+
+def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
+    """One observation: linear radiance (H, W, 3) and z-depth (H, W) in metres."""
+    import tracer
+
+    items, (lamp, ambient) = scene.items, light
+    left, right, rear, _, _ = scene.room
+
+    def lit(direct, albedo):
+        return lamp * direct + ambient * albedo
+
+    if kind == "mirror":
+        black = target.panel(np.zeros(3, np.float32))
+        moved = clutter(rng, rng.integers(1, 5), (left + 0.4, right - 0.4), (rear + 0.3, -0.1))
+        cover = sheet(rng, target, 0.003) if shown else []
+        direct, albedo, _ = tracer.shade(scene, [*items, *cover, black])
+        open_part = tracer.coverage(scene, [*items, *cover, target.panel(textures.paint(rng))]) if shown else alpha
+        radiance = lit(direct, albedo)
+        if open_part.max() > 0:
+            seen = lit(*tracer.reflection(scene, [*items, *moved], target.centre, target.normal))
+            dust = rng.uniform(0.0, 0.04) * smudges(rng, scene, target)[..., None] * radiance.mean()
+            tint = rng.uniform(0.82, 0.93) * np.array([0.98, 1.0, 0.98])
+            radiance = radiance + open_part[..., None] * (tint * seen + dust)
+        return radiance, tracer.z_depth(scene, [*items, black])
+
+    if kind == "pane":
+        x, y = target.centre[:2] - target.normal[:2] * rng.uniform(0.45, 1.2)
+        moved = clutter(rng, rng.integers(1, 3), (x - 0.35, x + 0.35), (y, y + 0.5))
+        card = sheet(rng, target, -0.003) if shown else []
+        direct, albedo, _ = tracer.shade(scene, [*items, *moved, *card])
+        carried = clutter(rng, rng.integers(0, 3), (left + 0.4, right - 0.4), (rear + 0.3, -0.1))
+        mirrored = lit(*tracer.reflection(scene, [*items, *carried], target.centre, target.normal))
+        share = (alpha * fresnel(scene, target))[..., None]
+        tint = 1 - alpha[..., None] * (1 - rng.uniform(0.86, 0.95) * np.array([0.96, 1.0, 0.975]))
+        through = lit(direct, albedo)
+        dust = alpha * rng.uniform(0.02, 0.07) * smudges(rng, scene, target) * through.mean()
+        radiance = through * tint * (1 - share) + share * mirrored + dust[..., None]
+        return radiance, tracer.z_depth(scene, [*items, *moved, target.panel(textures.paint(rng))])
+
+    x, y, z = target.base
+    ahead = np.array([x, y]) / np.hypot(x, y)
+    moved = []
+    for _ in range(rng.integers(0, 3)):
+        spot = (
+            np.array([x, y])
+            + ahead * rng.uniform(0.32, 0.6)
+            + np.array([-ahead[1], ahead[0]]) * rng.uniform(-0.3, 0.3)
+        )
+        moved += rooms.small_thing(rng, *spot, z if target.holder else 0.0, scale=0.9)
+    if shown:
+        look = (
+            textures.card(rng) if rng.random() < 0.4 else textures.mottled(rng, textures.colour(rng, 0.05, 0.9), 0.04)
+        )
+        body = target.body(look, float(rng.uniform(0.04, 0.15)))
+        direct, albedo, _ = tracer.shade(scene, [*items, *moved, body])
+        return lit(direct, albedo), tracer.z_depth(scene, [*items, *moved, body])
+    body = target.body(np.zeros(3, np.float32))
+    with_shadow, without = tracer.shade(scene, [*items, *moved, body]), tracer.shade(scene, [*items, *moved])
+    clear = 1 - alpha[..., None]
+    direct, albedo = (0.5 * a + 0.5 * clear * b for a, b in zip(with_shadow[:2], without[:2], strict=True))
+    rows, columns = np.nonzero(alpha > 0)
+    crop = columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1
+    inner = [target.cavity()] if target.hollow else []
+    glass = tracer.through_glass(scene, [*items, *moved, body, *inner], crop)
+    gain = lamp + ambient * without[1].mean() / max(without[0].mean(), 1e-6)
+    radiance = lit(direct, albedo)
+    window = (slice(crop[1], crop[1] + crop[3]), slice(crop[0], crop[0] + crop[2]))
+    radiance[window] += alpha[window][..., None] * glass * gain * rng.uniform(0.65, 0.85)
+    return radiance, tracer.z_depth(scene, [*items, *moved, body])
+
+
+def make_group(seed: int, kind: str):
+    """Images, mask, depths and reference of one group, or None where the plan turns out badly."""
+    import tracer
+
+    rng = np.random.default_rng([20260102, seed])
+    planned = plan(rng, kind)
+    if planned is None:
+        return None
+    scene, target = planned
+    matte = target.body(targets.treated(rng)) if kind == "solid" else target.panel(targets.treated(rng))
+    if kind == "mirror":  # the virtual camera must stay inside the room, or a wall would stand before it
+        virtual = tracer.mirrored_camera(scene.camera, target.centre, target.normal).origin
+        left, right, _, _, height = scene.room
+        if not (left < virtual[0] < right and 0.1 < virtual[2] < height) and abs(target.normal[1]) > 0.5:
+            return None
+    alpha = tracer.coverage(scene, [*scene.items, matte])
+    mask = alpha >= 0.5
+    least, most = (0.025, 0.25) if kind == "solid" else (0.08, 0.42)
+    unhidden = tracer.coverage(scene, [matte]) >= 0.5
+    edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
+    if not least < mask.mean() < most or edge > 0.08 or mask.sum() < 0.8 * unhidden.sum():
+        return None
+    depth = tracer.z_depth(scene, [*scene.items, matte])
+    if depth.min() < 0.25 or depth.max() > 30:
+        return None
+    lamp, ambient = rng.uniform(7, 13), rng.uniform(0.15, 0.4)
+    direct, albedo, _ = tracer.shade(scene, [*scene.items, matte])
+    reference = lamp * direct + ambient * albedo
+    exposure = tracer.auto_exposure(reference)
+    count = int(rng.integers(3, 8)) if rng.random() < 0.9 else int(rng.integers(8, 10))
+    hidden = max(1, round(count / 3))
+    shown = rng.permutation([True] * (count - hidden) + [False] * hidden)
+    images, depths = [], []
+    for surface_seen in shown:
+        light = (lamp * rng.uniform(0.75, 1.25), ambient * rng.uniform(0.75, 1.25))
+        radiance, depth = observe(rng, kind, scene, target, alpha, bool(surface_seen), light)
+        if not np.isfinite(radiance).all() or depth.min() < 0.25 or depth.max() > 30:
+            return None
+        images.append(tracer.develop(radiance, exposure * rng.uniform(0.75, 1.25)))
+        depths.append(np.round(depth * 1000).astype(np.uint16))
+    return {
+        "images": images,
+        "mask": mask,
+        "depths": depths,
+        "reference": tracer.develop(reference, exposure),
+        "shown": [bool(s) for s in shown],
+    }
+
+
+def work(task) -> str:
+    folder, kind, first_seed = task
+    for attempt in range(200):
+        group = make_group(first_seed + attempt, kind)
+        if group is not None:
+            break
+    else:
+        raise RuntimeError(f"{folder.name}: no plan in 200 attempts")
+    temporary = folder.with_name(folder.name + ".part")
+    shutil.rmtree(temporary, ignore_errors=True)
+    for name in ("images", "masks", "depths"):
+        (temporary / name).mkdir(parents=True)
+    for index, (image, depth) in enumerate(zip(group["images"], group["depths"], strict=True)):
+        Image.fromarray(image).save(temporary / "images" / f"{index:02d}.jpg", quality=95)
+        Image.fromarray(group["mask"].astype(np.uint8) * 255).save(
+            temporary / "masks" / f"{index:02d}.png", optimize=True
+        )
+        Image.fromarray(depth).save(temporary / "depths" / f"{index:02d}.png", optimize=True)
+    Image.fromarray(group["reference"]).save(temporary / "reference.jpg", quality=95)
+    facts = {"surface": KINDS[kind], "kind": kind, "seed": first_seed + attempt, "surface_seen": group["shown"]}
+    (temporary / "group.json").write_text(json.dumps(facts) + "\n")
+    os.replace(temporary, folder)
+    return folder.name
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("renders/groups"))
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    args = parser.parse_args()
+    tasks = []
+    for split, kinds in SPLITS.items():
+        (args.out / split).mkdir(parents=True, exist_ok=True)
+        for number, (kind, count) in enumerate(kinds.items()):
+            for index in range(count):
+                folder = args.out / split / f"{kind}_{index:03d}"
+                seed = FIRST_SEED[split] + (number * 1000 + index) * 200
+                if not folder.exists():
+                    tasks.append((folder, kind, seed))
+    with ProcessPoolExecutor(args.processes) as pool:
+        list(tqdm(pool.map(work, tasks), total=len(tasks), unit="group"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""The places where a target stands: panels on walls, standing panels and panes, objects on tables.
+
+The pre-training scenes put opaque twins (or empty frames) there, the groups put a mirror, a pane or a glass object.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import rooms
+import textures
+from rooms import Item, Scene, box, quad
+
+
+@dataclass
+class Flat:
+    """A rectangular target: centre, half vectors u (sideways) and v (up), normal towards the camera, its holder."""
+
+    centre: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    holder: list[Item]
+
+    @property
+    def normal(self) -> np.ndarray:
+        n = np.cross(self.u, self.v)
+        return n / np.linalg.norm(n)
+
+    def panel(self, texture: np.ndarray, gloss: float | None = None) -> Item:
+        return quad(self.centre, self.u, self.v, texture, gloss=gloss, role="target")
+
+
+@dataclass
+class Solid:
+    """A target that stands on something: the same outline as outer surface and as a slightly smaller hollow."""
+
+    base: np.ndarray
+    outline: np.ndarray
+    holder: list[Item]
+    hollow: bool
+
+    @property
+    def centre(self) -> np.ndarray:
+        return self.base + np.array([0, 0, self.outline[:, 1].max() / 2])
+
+    def body(self, texture: np.ndarray, gloss: float | None = None) -> Item:
+        return rooms.turned(self.base, self.outline, texture, gloss=gloss, role="target")
+
+    def cavity(self) -> Item:
+        top = self.outline[:, 1].max()
+        wall = 0.06 * self.outline[:, 0].max() + 0.002
+        inner = np.stack(
+            [np.maximum(self.outline[:, 0] - wall, 1e-4), np.clip(self.outline[:, 1], wall, top - wall)], 1
+        )
+        return rooms.turned(self.base, inner, np.full(3, 0.5, np.float32), role="hollow")
+
+
+def _facing(normal_yaw: float, tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Unit side and up vectors of a panel whose normal is -y turned by `normal_yaw`, leaning back by `tilt`."""
+    side = np.array([np.cos(normal_yaw), np.sin(normal_yaw), 0.0])
+    back = np.array([-np.sin(normal_yaw), np.cos(normal_yaw), 0.0])
+    up = np.cos(tilt) * np.array([0, 0, 1.0]) + np.sin(tilt) * back
+    return side, up
+
+
+def border(rng, centre, u, v, bar: float, depth: float) -> list[Item]:
+    """Four bars around a panel."""
+    tone = textures.wood(rng) if rng.random() < 0.5 else textures.mottled(rng, textures.colour(rng), 0.04)
+    su, sv = u / np.linalg.norm(u), v / np.linalg.norm(v)
+    n = np.cross(su, sv)
+    parts = []
+    for middle, a, b in (
+        (centre + u, bar / 2 * su, v + bar / 2 * sv),
+        (centre - u, bar / 2 * su, v + bar / 2 * sv),
+        (centre + v, u + bar / 2 * su, bar / 2 * sv),
+        (centre - v, u + bar / 2 * su, bar / 2 * sv),
+    ):
+        thick = n * depth / 2
+        points = np.array([middle + i * a + j * b + k * thick for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+        parts.append(Item({"type": "cube", "to_world": rooms.frame_matrix(a, b, thick, middle)}, tone, points))
+    return parts
+
+
+def wall_panel(rng, scene: Scene) -> Flat:
+    """Flush with the far wall or a side wall, in front of any opening there; framed or frameless."""
+    left, right, _, far, _ = scene.room
+    width, height = rng.uniform(0.55, 1.5), rng.uniform(0.7, 1.5)
+    z = max(rng.uniform(1.0, 1.5), height / 2 + 0.1)
+    side = rng.choice(3, p=[0.6, 0.2, 0.2])
+    gap = 0.03
+    if side == 0:
+        yaw, centre = 0.0, np.array([rng.uniform(left + width / 2 + 0.1, right - width / 2 - 0.1), far - gap, z])
+    else:
+        yaw, x = (np.pi / 2, left + gap) if side == 1 else (-np.pi / 2, right - gap)
+        centre = np.array([x, rng.uniform(1.6, max(1.7, far - width / 2 - 0.1)), z])
+    su, sv = _facing(yaw)
+    u, v = su * width / 2, sv * height / 2
+    back = box(
+        centre + np.array([np.sin(-yaw), np.cos(yaw), 0]) * 0.014, (width, 0.02, height), textures.paint(rng), yaw
+    )
+    holder = [back]
+    if rng.random() < 0.6:
+        holder += border(rng, centre, u, v, rng.uniform(0.03, 0.09), 0.05)
+    return Flat(centre, u, v, holder)
+
+
+def standing_panel(rng, scene: Scene, see_through: bool) -> Flat | None:
+    """On the floor, 1.3 to 3 m away: a leaning framed panel, or (see_through) an upright pane on feet."""
+    left, right, _, far, _ = scene.room
+    width = rng.uniform(0.6, 1.3) if see_through else rng.uniform(0.45, 1.0)
+    height = rng.uniform(0.9, 1.7)
+    nearest = 1.5 if width > 0.9 else 1.3
+    reach = max(nearest + 0.1, min(3.2, far - (0.9 if see_through else 0.5)))
+    spot = rooms.free_spot(rng, scene, width / 2, (max(left + 0.5, -1.1), min(right - 0.5, 1.1)), (nearest, reach))
+    if spot is None:
+        return None
+    yaw = rng.uniform(-0.35, 0.35)
+    lift = rng.uniform(0.02, 0.25) if see_through else rng.uniform(0.01, 0.08)
+    su, sv = _facing(yaw, 0.0 if see_through else rng.uniform(0.0, 0.12))
+    u, v = su * width / 2, sv * height / 2
+    centre = np.array([*spot, lift]) + v
+    holder: list[Item] = []
+    framed = rng.random() < (0.55 if see_through else 0.75)
+    if framed:
+        holder += border(rng, centre, u, v, rng.uniform(0.02, 0.06), 0.04)
+    tone = textures.mottled(rng, textures.colour(rng, 0.05, 0.6), 0.03)
+    for sign in (-0.75, 0.75):
+        foot = np.array([*spot, 0.0]) + su * sign * width / 2
+        holder.append(box(foot + np.array([0, 0, (lift + 0.05) / 2]), (0.06, 0.4, lift + 0.05), tone, yaw))
+    return Flat(centre, u, v, holder)
+
+
+def table_object(rng, scene: Scene) -> Solid | None:
+    """A ball, bottle, vase, tumbler or jar on a near table or stool, sometimes a large jar on the floor."""
+    left, right, _, far, _ = scene.room
+    kind = rng.choice(["ball", "bottle", "vase", "tumbler", "jar"], p=[0.3, 0.2, 0.15, 0.15, 0.2])
+    on_floor = rng.random() < 0.25
+    y_range = (1.4, min(2.3, far - 0.5)) if on_floor else (1.0, min(1.75, far - 0.6))
+    spot = rooms.free_spot(rng, scene, 0.42, (max(left + 0.5, -0.7), min(right - 0.5, 0.7)), y_range)
+    if spot is None:
+        return None
+    holder: list[Item] = []
+    z = 0.0
+    if not on_floor:
+        z = rng.uniform(0.5, 0.85)
+        holder = rooms.table(rng, *spot, rng.uniform(0.55, 0.8), rng.uniform(0.5, 0.7), z, rng.uniform(-0.5, 0.5))
+    scale = 1.9 if on_floor else 1.0
+    if kind == "ball":
+        radius = scale * rng.uniform(0.11, 0.19)
+        t = np.linspace(0, np.pi, 24)
+        outline = np.stack([np.maximum(np.sin(t), 1e-4) * radius, (1 - np.cos(t)) * radius], 1)
+    else:
+        outline = rooms.profile(rng, kind, scale * rng.uniform(0.25, 0.42), scale * rng.uniform(0.14, 0.26))
+    offset = np.zeros(2) if on_floor else rng.uniform(-0.1, 0.1, 2)
+    base = np.array([spot[0] + offset[0], spot[1] + offset[1], z])
+    return Solid(base, outline, holder, bool(rng.random() < 0.5))
+
+
+def aim(rng, scene: Scene, centre: np.ndarray) -> None:
+    """Turn the camera so that `centre` is well inside the picture, keeping the eye where it is."""
+    to = centre - scene.camera.origin
+    yaw = np.arctan2(to[0], to[1]) + rng.uniform(-0.22, 0.22)
+    pitch = np.clip(np.arctan2(to[2], np.hypot(to[0], to[1])) + rng.uniform(-0.1, 0.16), -0.55, 0.05)
+    scene.camera.forward = np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)])
+
+
+def treated(rng) -> np.ndarray:
+    """Matte spray or frosted film: off-white, slightly uneven."""
+    return textures.mottled(rng, textures.paint(rng, 0.6, 0.88), 0.06)

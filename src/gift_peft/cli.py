@@ -7,6 +7,7 @@ or SIGTERM ends with 130 or 143, as a shell expects. `--debug` or GIFT_PEFT_DEBU
 import argparse
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 
 
@@ -170,4 +171,5 @@ def _quiet() -> None:
     os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
-    os.environ.setdefault("TRANSFORMERS_NO_ADVISORY_WARNINGS", "1")
+    warnings.filterwarnings("ignore", category=FutureWarning)  # between transformers and peft, nothing a user can do
+    warnings.formatwarning = lambda message, *_, **__: f"gift-peft: warning: {message}\n"

@@ -149,13 +149,17 @@ def parse_arguments(argv: list[str]) -> GiftTrainingArguments:
     config.add_argument("--config", type=Path)
     path = config.parse_known_args(argv)[0].config
     from_file = [] if path is None else _yaml_to_argv(path)
+    for word in argv:
+        name = word.lstrip("-").split("=")[0].replace("-", "_")
+        if word.startswith("--") and name not in [*_names(), "help"]:
+            raise ValueError(f"unknown argument {word.split('=')[0]}{_nearest(name)}")
     parser = HfArgumentParser(GiftTrainingArguments, prog="gift-peft train", allow_abbrev=False)
     parser.error = _raise
     arguments, unknown = parser.parse_args_into_dataclasses(
         from_file + list(argv), return_remaining_strings=True, look_for_args_file=False
     )
     if unknown:
-        raise ValueError(f"unknown argument {unknown[0]}{_nearest(unknown[0].lstrip('-').split('=')[0])}")
+        raise ValueError(f"unknown argument {unknown[0]}")
     return arguments
 
 
@@ -173,10 +177,9 @@ def _yaml_to_argv(path: Path) -> list[str]:
         raise ValueError(f"config {path}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(values, dict):
         raise ValueError(f"config {path}: expected lines of the form `key: value`")
-    known = {f.name for f in fields(GiftTrainingArguments)} - {"config"}
     argv = []
     for key, value in values.items():
-        if key not in known:
+        if key not in _names() or key == "config":
             raise ValueError(f"config {path}: unknown key {key!r}{_nearest(str(key))}")
         if isinstance(value, dict):
             raise ValueError(f"config {path}: {key}: expected a value, not a mapping")
@@ -187,6 +190,10 @@ def _yaml_to_argv(path: Path) -> list[str]:
     return argv
 
 
+def _names() -> list[str]:
+    return [f.name for f in fields(GiftTrainingArguments)]
+
+
 def _nearest(name: str) -> str:
-    match = difflib.get_close_matches(name, [f.name for f in fields(GiftTrainingArguments)], n=1)
+    match = difflib.get_close_matches(name, _names(), n=1)
     return f"; did you mean {match[0]}?" if match else ""

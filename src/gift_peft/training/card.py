@@ -12,11 +12,11 @@ import torch
 import yaml
 
 from gift_peft.evaluation.report import REGION_NAMES, number, relative_change
-from gift_peft.training.arguments import GiftTrainingArguments
+from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 
 UPLOADED = ["adapter_model.safetensors", "adapter_config.json", "gift.json", "preprocessor_config.json", "README.md"]
 PACKAGES = ("gift-peft", "torch", "transformers", "peft", "accelerate", "datasets")
-NOT_RECORDED = ("config", "output_dir", "overwrite_output_dir", "proxies_dir", "resume_from_checkpoint", "report_to")
+RECORDED = ("dataset_name", "num_train_epochs", "max_steps", "retain")  # and all that a resumed run may not change
 METRICS = {"mae": "MAE", "abs_rel": "AbsRel", "rmse": "RMSE", "delta1": "delta1 (%)"}
 # Checked on the Hub; only the small one may be used commercially.
 LICENSES = {
@@ -38,7 +38,8 @@ def portable_name(name: str) -> str:
 
 def run_record(args: GiftTrainingArguments, **about) -> dict:
     """What was run, for gift.json: arguments, versions, kind of machine, and `about` (size, metrics, fingerprint)."""
-    arguments = {k: v for k, v in asdict(args).items() if k not in NOT_RECORDED and v is not None and v != []}
+    arguments = {k: v for k, v in asdict(args).items() if k in RECORDED or k not in FREE_TO_CHANGE}
+    arguments = {k: v for k, v in arguments.items() if v is not None and v != []}
     for name in ("model_name_or_path", "dataset_name"):
         arguments[name] = portable_name(arguments[name])
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{platform.machine()} CPU"

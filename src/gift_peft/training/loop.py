@@ -4,10 +4,9 @@ Frozen model -> proxies -> adapter with the paper's trainable parts -> one Adam 
 shuffled once per epoch -> validation after every epoch -> the adapter with the smallest validation GCE.
 """
 
-import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
@@ -21,14 +20,16 @@ from gift_peft.data.preprocess import Group, resolve_size
 from gift_peft.data.proxies import teacher_revision
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.results import REGIONS, jsonable, write_text
+from gift_peft.evaluation.report import number, relative_change
+from gift_peft.evaluation.results import REGIONS, jsonable
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import GeometryConsistencyError
 from gift_peft.training import card, checkpoints
 from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 from gift_peft.training.groups import PreparedGroups, epoch_order
 from gift_peft.training.progress import Progress
-from gift_peft.training.start import make_accelerator, open_run, stop_signals
+from gift_peft.training.start import check_run, claim_folder, make_accelerator, stop_signals
+from gift_peft.training.state import State, write_metrics
 from gift_peft.training.teacher import make_proxies
 
 
@@ -51,41 +52,6 @@ class TrainResult:
     signal: int | None = None
 
 
-@dataclass
-class State:
-    """Where a run stands; all of it is in `trainer_state.json`. The sums are over the groups of this epoch so far."""
-
-    step: int = 0
-    rows: list[dict] = field(default_factory=list)
-    best_step: int | None = None
-    loss: float = 0.0
-    consistency: float = 0.0
-    distillation: float = 0.0
-    gce: float = 0.0
-    num_groups: int = 0
-    num_groups_with_pair: int = 0
-
-    def add(self, loss: float, consistency: float, distillation: float, num_pairs: int) -> None:
-        """Count one group."""
-        self.loss += loss
-        self.consistency += consistency
-        self.distillation += distillation
-        self.num_groups += 1
-        if num_pairs:  # GCE leaves out groups without a pair, the loss counts them as 0
-            self.gce += consistency
-            self.num_groups_with_pair += 1
-
-    def close_epoch(self, epoch_steps: int) -> dict:
-        """The means since the last row, as the first half of a row; the sums start again."""
-        row = {"step": self.step, "epoch": self.step / epoch_steps}
-        for name in ("loss", "consistency", "distillation"):
-            row[name] = getattr(self, name) / self.num_groups if self.num_groups else None
-            setattr(self, name, 0.0)
-        row["train_gce"] = self.gce / self.num_groups_with_pair if self.num_groups_with_pair else None
-        self.gce, self.num_groups, self.num_groups_with_pair = 0.0, 0, 0
-        return row
-
-
 def train(args: GiftTrainingArguments) -> TrainResult:
     """Run, or go on with, a training; see `GiftTrainingArguments`.
 
@@ -93,14 +59,17 @@ def train(args: GiftTrainingArguments) -> TrainResult:
     the run with the group's name; the last checkpoint stays good.
     """
     accelerator = make_accelerator(args)
-    output, checkpoint = open_run(args, accelerator)
+    output, checkpoint = check_run(args, accelerator)
     run = Run(args, output, accelerator)
     state = run.restore(checkpoint) if checkpoint else State()
+    claim_folder(args, accelerator, fresh=checkpoint is None)
+    if args.report_to != "none":
+        accelerator.init_trackers("gift-peft", {k: str(v) for k, v in asdict(args).items()})
     progress = Progress(run.total_steps, state.step, accelerator.is_main_process)
     progress.say(run.describe(state, checkpoint))
     feed = run.groups_from(state.step)
     try:
-        with stop_signals(progress.say) as stop:
+        with stop_signals() as stop:
             while not (signum := run.agree(stop.signum)):
                 if run.row_is_due(state):
                     run.finish_epoch(state)
@@ -154,8 +123,6 @@ class Run:
         self.group_step = GroupStep(
             self.model, args.lambda_c, args.lambda_d, args.micro_batch_size, args.retain, accelerator
         )
-        if args.report_to != "none":
-            accelerator.init_trackers("gift-peft", {k: str(v) for k, v in asdict(args).items()})
 
     def _data(self) -> tuple[PreparedGroups, PreparedGroups | None]:
         """Train and, where there is one, validation groups with their proxies, which are made if missing."""
@@ -250,8 +217,8 @@ class Run:
         row = state.close_epoch(self.epoch_steps) | self._validate()
         row = {key: jsonable(value) for key, value in row.items()}
         state.rows.append(row)
-        best = next((r["val_gce"] for r in state.rows if r["step"] == state.best_step), None)
-        if state.step and row["val_gce"] is not None and (best is None or row["val_gce"] < best):
+        best = state.row_of(state.best_step)
+        if state.step and row["val_gce"] is not None and (best is None or row["val_gce"] < best["val_gce"]):
             state.best_step = state.step
             self._save_adapter(self.output / "adapter", state)
         if self.accelerator.is_main_process:
@@ -331,18 +298,25 @@ class Run:
         self._save_adapter(self.output / "adapter-last", state)
         if state.best_step is None:
             self._save_adapter(self.output / "adapter", state)
-        if self.accelerator.is_main_process:
-            print(f"Adapter: {self.output / 'adapter'} (step {state.best_step or state.step})", flush=True)
-            if self.args.push_to_hub:
-                print(
-                    f"Uploaded to https://huggingface.co/{card.push(self.output / 'adapter', self.args)}", flush=True
-                )
+        if not self.accelerator.is_main_process:
+            return
+        adapter, row = self.output / "adapter", state.row_of(state.best_step or state.step)
+        print(f"Adapter: {adapter} (step {row['step']})")
+        for title, key in (
+            ("validation GCE", "val_gce"),
+            ("ToM RMSE", "val_tom_rmse"),
+            ("Other RMSE", "val_other_rmse"),
+        ):
+            if row[key] is not None:
+                base = state.rows[0][key]
+                print(f"  {title:15}{number(base)} -> {number(row[key])} ({relative_change(base, row[key]):+.1f} %)")
+        if self.args.push_to_hub:
+            print(f"Uploaded: https://huggingface.co/{card.push(adapter, self.args)}")
 
     def _save_adapter(self, folder: Path, state: State, with_card: bool = True) -> None:
         """The adapter as it is now, with the last row as its metrics. Only the main process writes."""
         if not self.accelerator.is_main_process:
             return
-        row = next((r for r in reversed(state.rows) if r["step"] == state.step), None)
         record = card.run_record(
             self.args,
             step=state.step,
@@ -355,7 +329,7 @@ class Run:
             num_processes=self.accelerator.num_processes,
             base_revision=self.identity["model_name_or_path"],
             dataset_fingerprint=self.identity["dataset_name"],
-            metrics={"base": state.rows[0] if state.rows else None, "adapter": row},
+            metrics={"base": state.row_of(0), "adapter": state.row_of(state.step)},
         )
         save_adapter(
             self.model,
@@ -367,11 +341,6 @@ class Run:
             gift=record,
             card=card.model_card(self.args, record) if with_card else None,
         )
-
-
-def write_metrics(output: Path, rows: list[dict]) -> None:
-    """metrics.jsonl, whole: a resumed run drops the rows after its checkpoint."""
-    write_text(output / "metrics.jsonl", "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
 
 
 def _generic_recipe(args: GiftTrainingArguments) -> GiftRecipe | None:

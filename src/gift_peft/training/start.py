@@ -7,7 +7,7 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -39,10 +39,11 @@ def make_accelerator(args: GiftTrainingArguments) -> Accelerator:
     )
 
 
-def open_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Path, Path | None]:
-    """(output folder, checkpoint to go on from or None), the folder ready to be written and config.yaml in it.
+def check_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Path, Path | None]:
+    """(output folder, checkpoint to go on from or None). Changes nothing but leftovers of a killed run.
 
-    Raises ValueError if the folder holds a run that the arguments neither resume nor overwrite.
+    Raises ValueError if the folder holds a run that the arguments neither resume nor overwrite, OSError if it cannot
+    be written.
     """
     output = Path(args.output_dir)
     check_push(args)
@@ -57,19 +58,27 @@ def open_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Pat
         checkpoint = find_checkpoint(output, args.resume_from_checkpoint, warn)
         if checkpoint is None and (output / "adapter-last").exists():
             raise ValueError(f"resume_from_checkpoint: the run in {output} has ended and its checkpoints are gone")
+        if checkpoint is None:
+            warn(f"no checkpoint in {output} yet: starting from the beginning")
     elif not args.overwrite_output_dir and _holds_run(output):
         raise ValueError(
             f"output_dir: {output} already holds a run; --resume_from_checkpoint latest goes on with it, "
             "--overwrite_output_dir deletes it"
         )
+    output.mkdir(parents=True, exist_ok=True)
+    if not os.access(output, os.W_OK):
+        raise PermissionError(f"output_dir: {output} cannot be written")
     accelerator.wait_for_everyone()  # nobody writes before everybody has looked
-    if accelerator.is_main_process:
-        output.mkdir(parents=True, exist_ok=True)
-        if checkpoint is None:
-            _delete_run(output)
-        (output / "config.yaml").write_text(args.to_yaml(), encoding="utf-8")
-    accelerator.wait_for_everyone()
     return output, checkpoint
+
+
+def claim_folder(args: GiftTrainingArguments, accelerator: Accelerator, fresh: bool) -> None:
+    """Write config.yaml, in a `fresh` run after deleting an earlier one. For when all checks are done."""
+    if accelerator.is_main_process:
+        if fresh:
+            _delete_run(Path(args.output_dir))
+        (Path(args.output_dir) / "config.yaml").write_text(args.to_yaml(), encoding="utf-8")
+    accelerator.wait_for_everyone()
 
 
 def _holds_run(output: Path) -> bool:
@@ -86,7 +95,7 @@ def _delete_run(output: Path) -> None:
 
 
 @contextmanager
-def stop_signals(say: Callable[[str], None]) -> Iterator[SimpleNamespace]:
+def stop_signals() -> Iterator[SimpleNamespace]:
     """Inside, SIGINT (Ctrl-C) and SIGTERM (clusters) are noted in `.signum` (else 0); a second SIGINT interrupts."""
     stop = SimpleNamespace(signum=0)
 
@@ -94,7 +103,8 @@ def stop_signals(say: Callable[[str], None]) -> Iterator[SimpleNamespace]:
         if stop.signum and signum == signal.SIGINT:
             raise KeyboardInterrupt
         stop.signum = signum
-        say("Stopping after this group; Ctrl-C again stops at once, without a checkpoint")
+        # Not print: the signal may have come in the middle of one.
+        os.write(2, b"\nStopping after this group; Ctrl-C again stops at once, without a checkpoint\n")
 
     if threading.current_thread() is not threading.main_thread():
         yield stop  # Python delivers signals to the main thread only

@@ -120,7 +120,10 @@ def get_gift_model(model: nn.Module, rank: int = 8, head: str = "full", recipe: 
     check_lora_config(config)
     for _, module, key in list(dropout_rates(model)):
         setattr(module, key, 0.0)
-    return get_peft_model(model, config).train(model.training)  # new layers start in train mode, whatever the base
+    with warnings.catch_warnings():  # peft 0.21 reads an attribute that transformers 5.23 deprecates
+        warnings.filterwarnings("ignore", "`is_gradient_checkpointing` is deprecated", FutureWarning)
+        adapted = get_peft_model(model, config)
+    return adapted.train(model.training)  # PEFT's new layers start in train mode, whatever the base is in
 
 
 def check_lora_config(config: LoraConfig) -> None:

@@ -1,3 +1,49 @@
-"""Geometry-invariant fine-tuning (GIFT): depth models learn to see mirrors and glass, without depth labels."""
+"""Geometry-invariant fine-tuning (GIFT): depth models learn to see mirrors and glass, without depth labels.
+
+Importing the package makes `datasets.load_dataset("gift_i", data_dir=...)` work. The names below are imported when
+they are first used, so that `gift-peft --help` does not wait for torch.
+"""
+
+from importlib import import_module
+
+from gift_peft.data.gift_i import register
 
 __version__ = "0.1.0"
+
+_HOME = {
+    "GeometryConsistencyError": "losses",
+    "GiftI": "data.gift_i",
+    "GiftRecipe": "adapters",
+    "GroupStep": "group_step",
+    "PROTOCOLS": "evaluation.protocols",
+    "RECIPES": "adapters",
+    "align": "evaluation.alignment",
+    "depth_metrics": "evaluation.metrics",
+    "evaluate_gift_i": "evaluation.evaluate",
+    "geometry_consistency_error": "losses",
+    "get_gift_model": "adapters",
+    "gift_loss": "losses",
+    "group_consistency_loss": "losses",
+    "load_gift_i": "data.gift_i",
+    "masked_l1": "losses",
+    "save_adapter": "adapters",
+    "self_distillation_loss": "losses",
+    "set_adapter_scale": "adapters",
+}
+
+__all__ = ["__version__", *sorted(_HOME)]
+
+
+def __getattr__(name: str):
+    if name not in _HOME:
+        raise AttributeError(f"module 'gift_peft' has no attribute {name!r}")
+    value = getattr(import_module(f"gift_peft.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+register()

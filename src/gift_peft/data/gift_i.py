@@ -25,7 +25,7 @@ from datasets.builder import Key
 from gift_peft.data.preprocess import SURFACES, image_digest, to_mask
 from gift_peft.data.proxies import FORMAT, ProxyStore, default_proxies_dir, teacher_id, teacher_revision
 from gift_peft.data.raw import SPLITS, check_count, list_groups, natural_key, raw_example
-from gift_peft.data.rows import FORMAT_TYPE, IMAGE_COLUMNS
+from gift_peft.data.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
 from gift_peft.data.writer import check_group_id
 
 FEATURES = Features(
@@ -158,7 +158,7 @@ def load_gift_i(
             expected["size"] = f"{size[0]}x{size[1]}"
         command = proxies_command(teacher, path, expected.get("size"), proxies_dir, revision)
         store = ProxyStore(str(proxies / identity / name), expected, command)
-    return dataset.with_format(FORMAT_TYPE, train=name == "train", proxies=store)
+    return dataset.with_format(FORMAT_TYPE, rules=RowRules(train=name == "train", proxies=store))
 
 
 def proxies_command(teacher, path, size=None, proxies_dir=None, revision=None) -> str:
@@ -309,7 +309,7 @@ def dataset_fingerprint(dataset: datasets.Dataset) -> str:
     The same for raw tree, prepared folder and parquet of the same groups, and for any order of the groups.
     """
     groups = []
-    for row in dataset.with_format(FORMAT_TYPE):
+    for row in dataset.with_format(FORMAT_TYPE, rules=RowRules()):
         digest = hashlib.sha256(row["group_id"].encode())
         for name, image, mask in zip(row["image_names"], row["images"], row["masks"], strict=True):
             digest.update(f"\n{name} {image_digest(image)} ".encode())

@@ -21,6 +21,7 @@ import torch
 from gift_peft.data.preprocess import image_digest
 
 FORMAT = "gift-peft proxies 1"
+METADATA = "gift_peft"
 
 
 def teacher_id(base: str | Path, revision: str | None = None) -> str:
@@ -86,15 +87,17 @@ def default_proxies_dir(dataset: str | Path, teacher: str) -> Path:
     return Path(HF_HOME) / "gift-peft" / "proxies" / slug
 
 
-def write_proxies(path: Path, header: dict[str, str], proxies: torch.Tensor, reference: torch.Tensor | None) -> None:
+def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: torch.Tensor | None) -> None:
     """Write one file, whole or not at all. Leftovers of a killed attempt on the same group are removed."""
     tensors = {"proxies": proxies.float().contiguous()}
     if reference is not None:
         tensors["reference"] = reference.float().contiguous()
     path.parent.mkdir(parents=True, exist_ok=True)
+    # One entry, because safetensors writes several in random order, and equal proxies shall be equal files.
+    content = safetensors.torch.save(tensors, metadata={METADATA: json.dumps(header, sort_keys=True)})
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial")
     with open(partial, "wb") as file:
-        file.write(safetensors.torch.save(tensors, metadata=header))
+        file.write(content)
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)
@@ -102,50 +105,50 @@ def write_proxies(path: Path, header: dict[str, str], proxies: torch.Tensor, ref
         leftover.unlink(missing_ok=True)
 
 
-def make_header(teacher: str, revision: str, size: tuple[int, int], settings: dict) -> dict[str, str]:
-    """The part of a file's header that all groups share (safetensors: strings only); `row_digests` is the rest."""
+def make_header(teacher: str, revision: str, size: tuple[int, int], settings: dict) -> dict:
+    """The part of a file's header that all groups share; `row_digests` is the rest."""
     return {
         "format": FORMAT,
         "teacher": teacher,
         "revision": revision,
         "size": f"{size[0]}x{size[1]}",
-        "processor": json.dumps(settings, sort_keys=True),
+        "processor": settings,
     }
 
 
-def row_digests(row: dict) -> dict[str, str]:
-    """The part of a header that pins one group's pixels: `images`, in order, and `reference` ("" if none)."""
+def row_digests(row: dict) -> dict:
+    """The part of a header that pins one group's pixels: `images`, in order, and `reference` (None without one)."""
     reference = row["reference"]
     return {
-        "images": json.dumps([image_digest(image) for image in row["images"]]),
-        "reference": "" if reference is None else image_digest(reference),
+        "images": [image_digest(image) for image in row["images"]],
+        "reference": None if reference is None else image_digest(reference),
     }
 
 
-def read_header(path: Path) -> dict[str, str]:
-    """The header of a proxy file; ValueError if the file is damaged."""
+def read_header(path: Path) -> dict:
+    """The header of a proxy file, empty if it is not one of ours; ValueError if the file is damaged."""
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            return file.metadata() or {}
+            return json.loads((file.metadata() or {}).get(METADATA, "{}"))
     except safetensors.SafetensorError as error:
         raise ValueError(
             f"damaged proxy {path} ({str(error).splitlines()[0]}); make it again with --overwrite"
         ) from None
 
 
-def difference(header: dict[str, str], expected: dict[str, str], names: Sequence[str]) -> str | None:
+def difference(header: dict, expected: dict, names: Sequence[str]) -> str | None:
     """In words, the first way in which a proxy's header is not the expected one; None if it is."""
     for key in ("format", "teacher", "revision", "size", "processor"):
         if key in expected and header.get(key) != expected[key]:
             what = {"revision": "model or revision", "processor": "image processor"}.get(key, key)
             return f"it was made with {what} {header.get(key)}, not {expected[key]}"
-    made, now = json.loads(header.get("images", "[]")), json.loads(expected["images"])
+    made, now = header["images"], expected["images"]
     if len(made) != len(now):
         return f"it was made for {len(made)} images, and the group has {len(now)}"
     for name, before, after in zip(names, made, now, strict=True):
         if before != after:
             return f"image {name} has changed since"
-    if header.get("reference") != expected["reference"]:
+    if header["reference"] != expected["reference"]:
         return "the treated reference has changed since"
     return None
 
@@ -156,12 +159,12 @@ class ProxyStore:
 
     Args:
         folder (`str`): `proxies/<teacher>/<split>`.
-        expected (`dict[str, str]`): header entries known beforehand: format, teacher, revision and perhaps size.
+        expected (`dict`): header entries known beforehand: format, teacher, revision and perhaps size.
         command (`str`): the shell command that makes these proxies, for messages.
     """
 
     folder: str
-    expected: dict[str, str]
+    expected: dict
     command: str
 
     def read(self, row: dict) -> tuple[torch.Tensor, torch.Tensor | None]:
@@ -174,13 +177,14 @@ class ProxyStore:
         path = Path(self.folder) / f"{row['group_id']}.safetensors"
         if not path.exists():
             raise FileNotFoundError(f"missing proxy {path}; make it with `{self.command}`")
-        reason = difference(read_header(path), {**self.expected, **row_digests(row)}, names)
-        if reason:
-            raise ValueError(f"stale proxy {path}: {reason}; make it again with `{self.command} --overwrite`")
+        header = read_header(path)
         tensors = safetensors.torch.load_file(path)
-        for name, proxy in [*zip(names, tensors["proxies"], strict=True), ("reference", tensors.get("reference"))]:
+        for name, proxy in [*zip(names, tensors["proxies"], strict=False), ("reference", tensors.get("reference"))]:
             if proxy is not None and not torch.isfinite(proxy).all():
                 raise ValueError(
                     f"NaN or infinite values in proxy {path} ({name}); make it again with `{self.command} --overwrite`"
                 )
+        reason = difference(header, {**self.expected, **row_digests(row)}, names)
+        if reason:
+            raise ValueError(f"stale proxy {path}: {reason}; make it again with `{self.command} --overwrite`")
         return tensors["proxies"], tensors.get("reference")

@@ -5,6 +5,8 @@ DataLoader workers), only the rows that are accessed are decoded, and a damaged 
 the decoding of the `Image` feature alone does not give.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyarrow as pa
 from datasets import formatting
@@ -18,13 +20,23 @@ FORMAT_TYPE = "gift_i"
 IMAGE_COLUMNS = ("images", "masks", "valids", "depths")
 
 
-class GiftIFormatter(Formatter):
-    """Rows of GIFT-I. `train` asks for a target in some mask; `proxies` attaches `proxies` and `reference_proxy`."""
+@dataclass(frozen=True)
+class RowRules:
+    """`train` asks for a target in some mask; `proxies` attaches `proxies` and `reference_proxy`.
 
-    def __init__(self, train: bool = False, proxies: ProxyStore | None = None, features=None, token_per_repo_id=None):
+    A class of this module, so that unpickling a dataset in a fresh process imports and registers the formatter.
+    """
+
+    train: bool = False
+    proxies: ProxyStore | None = None
+
+
+class GiftIFormatter(Formatter):
+    """Rows of GIFT-I, read under `rules`."""
+
+    def __init__(self, rules: RowRules, features=None, token_per_repo_id=None):
         super().__init__(features=features, token_per_repo_id=token_per_repo_id)
-        self.train = train
-        self.proxies = proxies
+        self.rules = rules
 
     def format_row(self, pa_table: pa.Table) -> dict:
         return self._row(self.python_arrow_extractor().extract_row(pa_table))
@@ -48,8 +60,8 @@ class GiftIFormatter(Formatter):
                 row[key] = [self._picture(key, item, at) for item in value or []]
         if pictures.keys() == {*IMAGE_COLUMNS, "reference"} and {"group_id", "image_names"} <= row.keys():
             self._check(row)
-            if self.proxies is not None:
-                row["proxies"], row["reference_proxy"] = self.proxies.read(row)
+            if self.rules.proxies is not None:
+                row["proxies"], row["reference_proxy"] = self.rules.proxies.read(row)
         return {key: row[key] for key in [*stored, *(key for key in row if key not in stored)]}
 
     def _picture(self, column: str, item: dict, at: str) -> Image.Image:
@@ -69,7 +81,7 @@ class GiftIFormatter(Formatter):
         masks = [to_mask(mask, label) for mask in row["masks"]]
         valids = [to_mask(mask, label) for mask in row["valids"]]
         depths = [np.asarray(depth) for depth in row["depths"]]
-        check_group(group_id, names, row["images"], masks, valids, depths, row["reference"], train=self.train)
+        check_group(group_id, names, row["images"], masks, valids, depths, row["reference"], train=self.rules.train)
 
 
 def _open(item: dict, fallback: str) -> tuple[Image.Image, str]:

@@ -123,7 +123,7 @@ def make_proxies(
     return folder
 
 
-def _is_current(path: Path, expected: dict[str, str], names: Sequence[str], command: str) -> bool:
+def _is_current(path: Path, expected: dict, names: Sequence[str], command: str) -> bool:
     """Whether a group's proxies exist and hold; ValueError if they exist and do not."""
     if not path.exists():
         return False

@@ -1,0 +1,394 @@
+"""Proxies: made once, whole or absent, the same from any number of processes, refused when they no longer hold."""
+
+import itertools
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+
+import datasets
+import pytest
+import safetensors.torch
+import torch
+from accelerate import PartialState, debug_launcher
+from PIL import Image
+from tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
+from torch.utils.data import DataLoader
+
+from gift_peft.data import load_gift_i, write_gift_i
+from gift_peft.data.preprocess import collate_group, to_pixel_values
+from gift_peft.data.proxies import default_proxies_dir, read_header, write_proxies
+from gift_peft.training import teacher
+from gift_peft.training.teacher import make_proxies, predict_group, teacher_id, teacher_revision
+
+GROUPS = ["train/scene_0", "train/scene_1", "validation/scene_100"]
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
+
+
+def copy_base(base_dir, folder):
+    return shutil.copytree(base_dir, folder)
+
+
+def files(folder):
+    """Contents of all proxies under a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*.safetensors"))}
+
+
+def one_line(excinfo, *words):
+    message = str(excinfo.value)
+    assert "\n" not in message
+    for word in words:
+        assert str(word) in message, message
+
+
+def test_predict_group_is_float32_in_batches_of_two(model):
+    pixels = torch.randn(5, 3, *SIZE)
+    calls = []
+    model.register_forward_pre_hook(
+        lambda _, args, kwargs: calls.append(len(kwargs["pixel_values"])), with_kwargs=True
+    )
+    with torch.autocast("cpu", torch.bfloat16):
+        proxies = predict_group(model, pixels)
+    assert calls == [2, 2, 1]
+    assert proxies.dtype == torch.float32 and proxies.shape == (5, *SIZE) and not proxies.requires_grad
+    with torch.no_grad():
+        expected = torch.cat([model(pixel_values=pixels[i : i + 2]).predicted_depth for i in (0, 2, 4)])
+    assert torch.equal(proxies, expected)
+    assert torch.equal(predict_group(lambda_model(model), pixels), expected)  # a model that returns the tensor itself
+
+
+def lambda_model(model):
+    class Bare(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.inner = model
+
+        def forward(self, pixel_values):
+            return self.inner(pixel_values=pixel_values).predicted_depth
+
+    return Bare()
+
+
+def test_proxies_are_the_models_predictions(raw_tree, base_dir, model):
+    folder = make_proxies(base_dir, raw_tree, size=SIZE)
+    assert folder == raw_tree / "proxies" / teacher_id(base_dir)
+    assert list(files(folder)) == [f"{group}.safetensors" for group in GROUPS]
+    for split in ("train", "validation"):
+        for row in load_gift_i(raw_tree, split, teacher=base_dir, size=SIZE):
+            pixels = to_pixel_values(row["images"], tiny_processor(), SIZE)
+            assert torch.equal(row["proxies"], predict_group(model, pixels))
+            if split == "train":
+                assert row["reference_proxy"] is None
+            else:
+                pixels = to_pixel_values([row["reference"]], tiny_processor(), SIZE)
+                assert torch.equal(row["reference_proxy"], predict_group(model, pixels)[0])
+            group = collate_group(row, tiny_processor(), SIZE)
+            assert group.target.shape == group.mask.shape and group.target.dtype == torch.float32
+    header = read_header(folder / "validation/scene_100.safetensors")
+    assert header["size"] == "56x70" and header["processor"]["resample"] == 3
+    assert len(header["images"]) == 2 and len(header["reference"]) == 32
+
+
+def test_first_distillation_is_exactly_zero(raw_tree, base_dir, model):
+    from gift_peft.adapters import get_gift_model
+    from gift_peft.group_step import GroupStep
+
+    make_proxies(base_dir, raw_tree, splits=["train"], size=SIZE)
+    step = GroupStep(get_gift_model(model).eval())
+    for row in load_gift_i(raw_tree, "train", teacher=base_dir):
+        group = collate_group(row, tiny_processor(), SIZE)
+        output = step.accumulate(group.pixel_values, group.mask, group.target, group.valid, group.names)
+        assert output.distillation.item() == 0 and output.consistency.item() > 0
+
+
+def test_rows_with_proxies_behave_as_a_dataset(raw_tree, base_dir, tmp_path):
+    make_proxies(base_dir, raw_tree, size=SIZE, proxies_dir=tmp_path / "elsewhere")
+    rows = load_gift_i(raw_tree, "train", teacher=base_dir, proxies_dir=tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / teacher_id(base_dir) / "train/scene_1.safetensors").unlink()
+    assert rows[0]["proxies"].shape == (2, *SIZE)  # only the rows that are accessed are read
+    assert rows["group_id"][:] == ["scene_0", "scene_1"]
+    with pytest.raises(FileNotFoundError, match="scene_1"):
+        rows[1]
+    loader = DataLoader(
+        rows.shuffle(seed=1).filter(lambda i: i == "scene_0", input_columns="group_id"), None, num_workers=1
+    )
+    assert [row["proxies"].shape for row in map(dict, loader_rows(loader))] == [(2, *SIZE)]
+    one = load_gift_i(raw_tree, "train[:1]", teacher=base_dir, proxies_dir=tmp_path / "elsewhere")
+    assert one[0]["proxies"].equal(rows[0]["proxies"])
+
+
+def loader_rows(loader):
+    loader.collate_fn = dict
+    return loader
+
+
+def test_prepared_and_default_size(raw_tree, base_dir, tmp_path, monkeypatch):
+    """The recipe's size is the paper's; a generic model takes the processor's."""
+    from gift_peft import adapters
+
+    group = load_gift_i(raw_tree, "validation")[0]
+    record = {"split": "validation", **{key: group[key] for key in ("group_id", "images", "masks", "reference")}}
+    folder = write_gift_i([record], tmp_path / "prepared", license="cc0-1.0")
+    monkeypatch.setattr(adapters, "RECIPES", {})
+    made = make_proxies(base_dir, folder)
+    assert read_header(made / "validation/scene_100.safetensors")["size"] == "56x70"
+    plain = datasets.load_dataset(str(folder))  # the proxies beside the groups change nothing for others
+    assert len(plain["validation"]) == 1
+    assert load_gift_i(folder, "validation", teacher=base_dir)[0]["proxies"].shape == (2, *SIZE)
+
+
+# ---- resuming and several processes ----
+
+
+def test_finished_groups_are_kept(raw_tree, base_dir, monkeypatch):
+    folder = make_proxies(base_dir, raw_tree, size=SIZE)
+    before, times = files(folder), {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")}
+    lost = folder / f"{GROUPS[1]}.safetensors"
+    lost.unlink()
+    asked = []
+    predict = teacher._predict_row
+    monkeypatch.setattr(teacher, "_predict_row", lambda *args: asked.append(args[2]["group_id"]) or predict(*args))
+    make_proxies(base_dir, raw_tree, size=SIZE)
+    assert asked == ["scene_1"] and files(folder) == before
+    assert all(path.stat().st_mtime_ns == time for path, time in times.items() if path != lost)
+    make_proxies(base_dir, raw_tree, size=SIZE, overwrite=True)
+    assert len(asked) == 4 and files(folder) == before
+
+
+@pytest.mark.parametrize("moment", ["while writing", "before the rename"])
+def test_kill_leaves_no_broken_file(raw_tree, base_dir, tmp_path, moment):
+    whole = files(make_proxies(base_dir, raw_tree, size=SIZE, proxies_dir=tmp_path / "whole"))
+
+    def killed():
+        """Writes the first group's file, and dies with the second's half or wholly on disk."""
+        calls = itertools.count()
+
+        def fsync(descriptor):
+            if next(calls) == 1:
+                if moment == "while writing":
+                    os.ftruncate(descriptor, 1000)
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        os.fsync = fsync
+        PartialState._reset_state()
+        make_proxies(base_dir, raw_tree, size=SIZE)
+
+    process = multiprocessing.get_context("fork").Process(target=killed)
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    folder = raw_tree / "proxies" / teacher_id(base_dir)
+    left = files(folder)
+    assert len(left) == 1 and left.items() <= whole.items()
+    assert len(list(folder.rglob(".*.partial"))) == 1
+    make_proxies(base_dir, raw_tree, size=SIZE)
+    assert files(folder) == whole and not list(folder.rglob(".*.partial"))
+
+
+def _make_in_two(base, raw, proxies):
+    PartialState._reset_state()
+    PartialState(cpu=True)
+    make_proxies(base, raw, size=SIZE, proxies_dir=proxies)
+
+
+def _fail_in_two(base, raw, proxies, seen):
+    try:
+        _make_in_two(base, raw, proxies)
+    except ValueError as error:
+        (seen / str(PartialState().process_index)).write_text(str(error))
+
+
+def test_two_processes_make_the_same_files(base_dir, tmp_path):
+    raw = write_raw_tree(tmp_path / "raw", train=(2, 3, 5), validation=(1, 2))
+    alone = make_proxies(base_dir, raw, size=SIZE, proxies_dir=tmp_path / "one")
+    debug_launcher(_make_in_two, (base_dir, raw, tmp_path / "two"), num_processes=2)
+    assert files(tmp_path / "two" / alone.name) == files(alone) and len(files(alone)) == 5
+    # What one process stumbles over, all report, and none is left waiting.
+    stale = tmp_path / "two" / alone.name / "train" / "scene_1.safetensors"
+    Image.new("RGB", (80, 60)).save(raw / "train/scene_1/0.png")
+    (tmp_path / "seen").mkdir()
+    debug_launcher(_fail_in_two, (base_dir, raw, tmp_path / "two", tmp_path / "seen"), num_processes=2)
+    messages = {path.read_text() for path in (tmp_path / "seen").iterdir()}
+    assert len(list((tmp_path / "seen").iterdir())) == 2 and len(messages) == 1
+    assert f"stale proxy {stale}: image 0.png has changed since" in messages.pop()
+
+
+# ---- what no longer holds ----
+
+
+def repaint(raw):
+    Image.new("RGB", (80, 60), (9, 8, 7)).save(raw / "validation/scene_100/1.png")
+
+
+def retreat(raw):
+    Image.new("RGB", (80, 60), (9, 8, 7)).save(raw / "validation/scene_100/reference.png")
+
+
+def add_image(raw):
+    Image.new("RGB", (80, 60)).save(raw / "validation/scene_100/2.png")
+    shutil.copy(raw / "validation/scene_100/masks/1.png", raw / "validation/scene_100/masks/2.png")
+
+
+STALE = {
+    "image": (repaint, "image 1.png has changed since"),
+    "reference": (retreat, "the treated reference has changed since"),
+    "count": (add_image, "it was made for 2 images, and the group has 3"),
+}
+
+
+@pytest.mark.parametrize("name", STALE)
+def test_changed_images_make_proxies_stale(raw_tree, base_dir, name):
+    change, reason = STALE[name]
+    folder = make_proxies(base_dir, raw_tree, size=SIZE)
+    change(raw_tree)
+    path = folder / "validation/scene_100.safetensors"
+    with pytest.raises(ValueError) as excinfo:
+        load_gift_i(raw_tree, "validation", teacher=base_dir)[0]
+    one_line(excinfo, f"stale proxy {path}: {reason}", f"gift-peft proxies --base {base_dir}", "--overwrite")
+    with pytest.raises(ValueError) as excinfo:
+        make_proxies(base_dir, raw_tree, size=SIZE)
+    one_line(excinfo, f"stale proxy {path}: {reason}", "--overwrite")
+    make_proxies(base_dir, raw_tree, size=SIZE, overwrite=True)
+    row = load_gift_i(raw_tree, "validation", teacher=base_dir)[0]
+    assert len(row["proxies"]) == len(row["images"])
+
+
+def test_reencoded_images_keep_their_proxies(raw_tree, base_dir):
+    make_proxies(base_dir, raw_tree, size=SIZE)
+    path = raw_tree / "train/scene_0/0.png"
+    before = path.read_bytes()
+    Image.open(path).save(path, compress_level=1)
+    assert path.read_bytes() != before
+    assert load_gift_i(raw_tree, "train", teacher=base_dir)[0]["proxies"] is not None
+
+
+def test_other_weights_under_the_same_path_are_detected(raw_tree, base_dir, tmp_path):
+    base = copy_base(base_dir, tmp_path / "base")
+    folder = make_proxies(base, raw_tree, size=SIZE)
+    shutil.copytree(base, tmp_path / "moved" / "base")  # the same model elsewhere is the same teacher
+    assert load_gift_i(raw_tree, "train", teacher=tmp_path / "moved" / "base")[0]["proxies"] is not None
+    shutil.rmtree(base)
+    write_base(base, seed=1)
+    for use in (
+        lambda: load_gift_i(raw_tree, "train", teacher=base)[0],
+        lambda: make_proxies(base, raw_tree, size=SIZE),
+    ):
+        with pytest.raises(ValueError) as excinfo:
+            use()
+        one_line(excinfo, f"stale proxy {folder / 'train/scene_0.safetensors'}", "model or revision sha256:")
+
+
+def test_other_size_or_processor(raw_tree, base_dir, tmp_path):
+    base = copy_base(base_dir, tmp_path / "base")
+    make_proxies(base, raw_tree, size=SIZE)
+    for use in (
+        lambda: load_gift_i(raw_tree, "train", teacher=base, size=(56, 84))[0],
+        lambda: make_proxies(base, raw_tree, size="56x84"),
+    ):
+        with pytest.raises(ValueError) as excinfo:
+            use()
+        one_line(excinfo, "it was made with size 56x70, not 56x84", "--size 56x84 --overwrite")
+    row = load_gift_i(raw_tree, "train", teacher=base)[0]
+    with pytest.raises(ValueError, match=r"scene_0: its proxies are 56x70 but the size in use is 56x84"):
+        collate_group(row, tiny_processor(), (56, 84))
+    settings = json.loads((base / "preprocessor_config.json").read_text())
+    (base / "preprocessor_config.json").write_text(json.dumps({**settings, "resample": 2}))
+    with pytest.raises(ValueError, match="stale proxy"):
+        load_gift_i(raw_tree, "train", teacher=base)[0]
+
+
+def test_hub_ids_are_pinned_by_commit(raw_tree, base_dir, tmp_path, monkeypatch):
+    """A stand-in for the hub's local cache: `main` moves from one commit to the next."""
+    commits = {}
+
+    def cached_file(repository, name, revision=None):
+        if repository != "owner/net":
+            raise OSError(f"{repository} is not a repository\nand more lines")
+        return f"/cache/models--owner--net/snapshots/{commits[revision or 'main']}/{name}"
+
+    monkeypatch.setattr("transformers.utils.cached_file", cached_file)
+    monkeypatch.setattr(teacher, "load_teacher", lambda base, revision: (tiny_model(), tiny_processor()))
+    commits["main"] = commits["v1"] = "a" * 40
+    assert teacher_id("owner/net") == "owner--net" and teacher_id("owner/net", "v1") == "owner--net@v1"
+    assert teacher_revision("owner/net", "v1") == "a" * 40
+    folder = make_proxies("owner/net", raw_tree, size=SIZE)
+    make_proxies("owner/net", raw_tree, size=SIZE, revision="v1")
+    commits["main"] = "b" * 40
+    with pytest.raises(ValueError) as excinfo:
+        load_gift_i(raw_tree, "train", teacher="owner/net")[0]
+    one_line(excinfo, folder, f"model or revision {'a' * 40}, not {'b' * 40}")
+    row = load_gift_i(raw_tree, "train", teacher="owner/net", revision="v1")[0]
+    assert row["proxies"].shape == (2, *SIZE)
+    with pytest.raises(FileNotFoundError) as excinfo:
+        load_gift_i(raw_tree, "train", teacher="owner/other")
+    one_line(excinfo, "owner/other")
+
+
+def test_missing_proxy_names_file_and_command(raw_tree, base_dir):
+    with pytest.raises(FileNotFoundError) as excinfo:
+        load_gift_i(raw_tree, "train", teacher=base_dir, size=SIZE)[0]
+    command = f"gift-peft proxies --base {base_dir} --dataset {raw_tree} --size 56x70"
+    one_line(excinfo, raw_tree / "proxies" / base_dir.name / "train/scene_0.safetensors", f"`{command}`")
+
+
+def test_damaged_and_nan_proxies(raw_tree, base_dir):
+    path = make_proxies(base_dir, raw_tree, size=SIZE) / "validation/scene_100.safetensors"
+    tensors, header = safetensors.torch.load_file(path), read_header(path)
+    for key, at, name in (("proxies", (1, 3, 4), "1.png"), ("reference", (3, 4), "reference")):
+        bad = {other: tensor.clone() for other, tensor in tensors.items()}
+        bad[key][at] = float("nan")
+        write_proxies(path, header, **bad)
+        with pytest.raises(ValueError) as excinfo:
+            load_gift_i(raw_tree, "validation", teacher=base_dir)[0]
+        one_line(excinfo, f"NaN or infinite values in proxy {path} ({name})", "gift-peft proxies")
+    path.write_bytes(path.read_bytes()[:500])
+    for use in (
+        lambda: load_gift_i(raw_tree, "validation", teacher=base_dir)[0],
+        lambda: make_proxies(base_dir, raw_tree, size=SIZE),
+    ):
+        with pytest.raises(ValueError) as excinfo:
+            use()
+        one_line(excinfo, f"damaged proxy {path}", "--overwrite")
+
+
+def test_nan_predictions_name_group_and_image(raw_tree, base_dir, tmp_path):
+    base = tiny_model()
+    with torch.no_grad():
+        base.head.conv3.bias.fill_(float("nan"))
+    base.save_pretrained(tmp_path / "nan")
+    tiny_processor().save_pretrained(tmp_path / "nan")
+    with pytest.raises(ValueError) as excinfo:
+        make_proxies(tmp_path / "nan", raw_tree, size=SIZE)
+    one_line(excinfo, "group scene_0, 0.png", "NaN")
+    assert not list((raw_tree / "proxies").rglob("*.safetensors"))
+
+
+def test_wrong_bases_and_sizes(raw_tree, base_dir, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"empty: the folder has no config.json"):
+        make_proxies(tmp_path / "empty", raw_tree)
+    only_model = copy_base(base_dir, tmp_path / "bare")
+    (only_model / "preprocessor_config.json").unlink()
+    with pytest.raises(ValueError, match=re.escape(str(only_model))):
+        make_proxies(only_model, raw_tree, size=SIZE)
+    with pytest.raises(ValueError, match="multiples of the patch size 14"):
+        make_proxies(base_dir, raw_tree, size=(50, 70))
+
+
+def test_where_proxies_are_kept(tmp_path, monkeypatch):
+    """In the dataset's folder where that can be written or brings them, else in the cache."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HOME", str(tmp_path / "home"))
+    cached = tmp_path / "home/gift-peft/proxies"
+    (tmp_path / "a").mkdir()
+    assert default_proxies_dir(tmp_path / "a", "net") == tmp_path / "a" / "proxies"
+    assert default_proxies_dir("owner/gift-i", "net") == cached / "owner--gift-i"
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert default_proxies_dir(tmp_path / "a", "net").parent == cached
+    (tmp_path / "a/proxies/net").mkdir(parents=True)
+    assert default_proxies_dir(tmp_path / "a", "net") == tmp_path / "a" / "proxies"

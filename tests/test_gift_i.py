@@ -10,13 +10,15 @@ import datasets
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import torch
 from datasets.table import embed_table_storage
 from PIL import Image
-from tiny import write_group, write_raw_tree
+from tiny import SIZE, tiny_processor, write_group, write_raw_tree
 from torch.utils.data import DataLoader
 
 from gift_peft.data import FEATURES, GiftI, dataset_fingerprint, load_gift_i, register, write_gift_i
 from gift_peft.data.gift_i import gift_i_splits
+from gift_peft.data.preprocess import collate_group
 from gift_peft.data.writer import SCHEMA
 
 CLEARGRASP = os.path.join(os.path.dirname(__file__), "..", "..", "shared", "data", "cleargrasp_d435")
@@ -101,7 +103,12 @@ def test_streaming_workers_and_slices(prepared):
         assert datasets.load_dataset(**name, split="train", num_proc=2)["group_id"][:] == ["scene_0", "scene_1"]
         assert datasets.load_dataset(**name, split="train[1:]")["group_id"][:] == ["scene_1"]
     stream = datasets.load_dataset(str(prepared), split="validation", streaming=True, features=FEATURES)
-    assert next(iter(stream))["surface"] == 0
+    row = next(iter(stream))
+    assert row["surface"] == 0
+    group = collate_group(row, tiny_processor(), SIZE)
+    again = collate_group(load_gift_i(prepared, "validation")[0], tiny_processor(), SIZE)
+    assert group.surface == "mirror" and torch.equal(group.pixel_values, again.pixel_values)
+    assert torch.equal(group.mask, again.mask) and torch.equal(group.depths[1], again.depths[1])
 
 
 def test_rows_behave_as_a_dataset(prepared):
@@ -311,6 +318,13 @@ def test_damaged_prepared_folder(prepared, name):
     with pytest.raises((ValueError, FileNotFoundError)) as excinfo:
         load_gift_i(prepared, "train")[0]
     one_line(excinfo, os.path.basename(file), words)
+
+
+def test_a_third_mask_value_in_a_prepared_folder_names_the_image(prepared):
+    save_mask(prepared / "train/scene_0/masks/01_1.png", np.arange(4800).reshape(60, 80) % 3)
+    with pytest.raises(ValueError) as excinfo:
+        load_gift_i(prepared, "train")[0]
+    one_line(excinfo, "group scene_0: the mask of 1.png: 3 different values")
 
 
 def test_group_of_one(raw_tree):

@@ -347,6 +347,10 @@ def test_damaged_and_nan_proxies(raw_tree, base_dir):
         with pytest.raises(ValueError) as excinfo:
             load_gift_i(raw_tree, "validation", teacher=base_dir)[0]
         one_line(excinfo, f"NaN or infinite values in proxy {path} ({name})", "gift-peft proxies")
+    safetensors.torch.save_file({"other": torch.zeros(1)}, path)
+    with pytest.raises(ValueError, match=r"damaged proxy .*scene_100.*not a proxy file"):
+        load_gift_i(raw_tree, "validation", teacher=base_dir)[0]
+    write_proxies(path, header, **tensors)
     path.write_bytes(path.read_bytes()[:500])
     for use in (
         lambda: load_gift_i(raw_tree, "validation", teacher=base_dir)[0],

@@ -5,6 +5,8 @@ is compared with come from identical pixels. Images are resized by the image pro
 nearest pixel centre.
 """
 
+from __future__ import annotations
+
 import hashlib
 import io
 import math
@@ -12,10 +14,13 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from PIL import Image, ImageOps
+
+if TYPE_CHECKING:  # torch takes longer to import than the command line takes to answer --help
+    import torch
 
 SURFACES = ["mirror", "transparent"]
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm"}
@@ -242,6 +247,8 @@ def to_pixel_values(images: Sequence[Image.Image], processor, size: tuple[int, i
     Keep-aspect and padding settings are ignored: `size` is final. Spelled out here because the torchvision backend,
     which transformers takes where torchvision is installed, has another bicubic.
     """
+    import torch
+
     settings = pixel_settings(processor)
     height, width = size
     arrays = []
@@ -272,6 +279,8 @@ def collate_group(row: dict, processor, size: tuple[int, int]) -> Group:
     Raises ValueError naming the group and image for a mask of another size, a mask that is not one, an image that is
     not 8-bit RGB, and proxies made at another size.
     """
+    import torch
+
     group_id, names = row["group_id"], list(row["image_names"])
     images = [to_rgb(*item) for item in label_items(group_id, names, "image", row["images"])]
     masks = [to_mask(*item) for item in label_items(group_id, names, "mask", row["masks"])]
@@ -296,12 +305,16 @@ def collate_group(row: dict, processor, size: tuple[int, int]) -> Group:
 
 
 def _stack_masks(masks: Sequence[np.ndarray], size: tuple[int, int]) -> torch.Tensor:
+    import torch
+
     return torch.from_numpy(np.stack([resize_mask(mask, size) for mask in masks]))
 
 
 def _sized_proxies(proxies, size: tuple[int, int], group_id: str) -> torch.Tensor | None:
     if proxies is None:
         return None
+    import torch
+
     proxies = torch.as_tensor(proxies)
     if tuple(proxies.shape[-2:]) != tuple(size):
         made = "x".join(map(str, proxies.shape[-2:]))

@@ -5,6 +5,8 @@ group has a treated reference, `reference` (h, w). The header names the teacher,
 processor's settings and a digest of every image's decoded content: a proxy of other weights or pixels is never used.
 """
 
+from __future__ import annotations
+
 import functools
 import hashlib
 import json
@@ -13,12 +15,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import safetensors
-import safetensors.torch
-import torch
 
 from gift_peft.data.preprocess import image_digest
+
+if TYPE_CHECKING:
+    import torch
 
 FORMAT = "gift-peft proxies 1"
 METADATA = "gift_peft"
@@ -89,6 +93,8 @@ def default_proxies_dir(dataset: str | Path, teacher: str) -> Path:
 
 def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: torch.Tensor | None) -> None:
     """Write one file, whole or not at all. Leftovers of a killed attempt on the same group are removed."""
+    import safetensors.torch
+
     tensors = {"proxies": proxies.float().contiguous()}
     if reference is not None:
         tensors["reference"] = reference.float().contiguous()
@@ -173,14 +179,20 @@ class ProxyStore:
         Raises FileNotFoundError for a missing file and ValueError for a stale, damaged or NaN one, naming it and the
         command that makes it again.
         """
+        import safetensors.torch
+
         names = row["image_names"]
         path = Path(self.folder) / f"{row['group_id']}.safetensors"
         if not path.exists():
             raise FileNotFoundError(f"missing proxy {path}; make it with `{self.command}`")
         header = read_header(path)
         tensors = safetensors.torch.load_file(path)
+        if "proxies" not in tensors:
+            raise ValueError(
+                f"damaged proxy {path} (not a proxy file); make it again with `{self.command} --overwrite`"
+            )
         for name, proxy in [*zip(names, tensors["proxies"], strict=False), ("reference", tensors.get("reference"))]:
-            if proxy is not None and not torch.isfinite(proxy).all():
+            if proxy is not None and not proxy.isfinite().all():
                 raise ValueError(
                     f"NaN or infinite values in proxy {path} ({name}); make it again with `{self.command} --overwrite`"
                 )

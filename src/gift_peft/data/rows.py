@@ -13,7 +13,7 @@ from datasets import formatting
 from datasets.formatting.formatting import Formatter
 from PIL import Image
 
-from gift_peft.data.preprocess import check_group, open_image, to_mask, to_rgb
+from gift_peft.data.preprocess import check_group, label_items, open_image, to_mask, to_rgb
 from gift_peft.data.proxies import ProxyStore
 
 FORMAT_TYPE = "gift_i"
@@ -77,9 +77,8 @@ class GiftIFormatter(Formatter):
 
     def _check(self, row: dict) -> None:
         group_id, names = row["group_id"], row["image_names"]
-        label = f"group {group_id}, a mask"
-        masks = [to_mask(mask, label) for mask in row["masks"]]
-        valids = [to_mask(mask, label) for mask in row["valids"]]
+        masks = [to_mask(*item) for item in label_items(group_id, names, "mask", row["masks"])]
+        valids = [to_mask(*item) for item in label_items(group_id, names, "valid mask", row["valids"], True)]
         depths = [np.asarray(depth) for depth in row["depths"]]
         check_group(group_id, names, row["images"], masks, valids, depths, row["reference"], train=self.rules.train)
 

@@ -115,16 +115,16 @@ def evaluate_gift_i(
 
 
 def run_evaluation(
-    base: str,
-    dataset: str,
-    adapter: str | None = None,
+    base: str | Path,
+    dataset: str | Path,
+    adapter: str | Path | None = None,
     *,
     reference: str = "proxy",
     protocol: str | None = None,
     split: str = "validation",
     out: str | Path = "evaluation",
     adapter_scale: float | None = None,
-    size: tuple[int, int] | None = None,
+    size: str | tuple[int, int] | None = None,
     kind: str | None = None,
     revision: str | None = None,
     dataset_revision: str | None = None,
@@ -148,9 +148,9 @@ def run_evaluation(
         progress=progress,
     )
     report.about = {
-        "base": base,
+        "base": str(base),
         "revision": revision,
-        "adapter": adapter,
+        "adapter": adapter and str(adapter),
         "adapter_scale": adapter_scale,
         "dataset": str(dataset),
         "split": split,

@@ -5,6 +5,7 @@ the number of skipped images, without which the numbers above say little (`gift_
 """
 
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,21 +76,18 @@ class Panel:
 
 
 def text_table(report: GiftIReport, color: bool = False) -> str:
-    """The report as aligned plain text, at most 80 columns; improvements carry a `*` (and green if `color`)."""
+    """The report as aligned plain text of at most 80 columns; improvements carry a `*` (and green if `color`)."""
     lines = [_paint(_title(report), BOLD, color), ""]
-    header = ["MAE", "AbsRel", "RMSE", "delta1 %"]
-    lines.append(f"{'':18}" + "".join(f"{name:>13}" for name in header))
+    lines.append(_text_line("", ["MAE", "AbsRel", "RMSE", "delta1 %"], color, 18))
     for region in REGIONS:
         for index, (label, cells) in enumerate(_block(report, region)):
             name = REGION_NAMES[region] if index == 0 else ""
-            lines.append(f"{name:6}{label:12}" + "".join(_text_cell(cell, color) for cell in cells))
+            lines.append(_text_line(f"{name:6}{label}", cells, color, 18))
         lines.append("")
-    lines += [_text_pair(label, pair, color) for label, pair in _gce_pairs(report)]
-    surfaces = _surface_pairs(report)
-    if surfaces:
-        lines += ["", "ToM RMSE per surface"]
-        lines += [_text_pair(label, pair, color) for label, pair in surfaces]
-    return "\n".join([*lines, "", *_notes(report)]) + "\n"
+    lines.append(_text_line("", ["base", "adapted", "change", "consensus"], color, 26))
+    lines += [_text_line(label, cells, color, 26) for label, cells in _pairs(report)]
+    notes = [line for note in _notes(report) for line in textwrap.wrap(note, 80)]
+    return "\n".join([*lines, "", *notes]) + "\n"
 
 
 def markdown_table(report: GiftIReport) -> str:
@@ -100,12 +98,8 @@ def markdown_table(report: GiftIReport) -> str:
         for index, (label, cells) in enumerate(_block(report, region)):
             name = REGION_NAMES[region] if index == 0 else ""
             lines.append(f"| {name} | {label} | " + " | ".join(_markdown_cell(cell) for cell in cells) + " |")
-    pairs = [(label, pair) for label, pair in _gce_pairs(report)]
-    pairs += [(f"ToM RMSE, {label}", pair) for label, pair in _surface_pairs(report)]
     lines += ["", "| | base | adapted | change | consensus |", "|---|---:|---:|---:|---:|"]
-    for label, (base, adapted, change, consensus) in pairs:
-        cells = [number(base), number(adapted), _markdown_cell(change), number(consensus)]
-        lines.append(f"| {label} ↓ | " + " | ".join(cells) + " |")
+    lines += [f"| {label} ↓ | " + " | ".join(map(_markdown_cell, cells)) + " |" for label, cells in _pairs(report)]
     return "\n".join([*lines, "", *(f"{note}  " for note in _notes(report))]) + "\n"
 
 
@@ -152,24 +146,20 @@ def _change(metric: str, base: dict, adapted: dict) -> tuple[float, bool]:
     return change, improved(metric, change)
 
 
-def _gce_pairs(report: GiftIReport) -> list[tuple[str, tuple]]:
+def _pairs(report: GiftIReport) -> list[tuple[str, list]]:
+    """(label, [base, adapted, change, consensus]) of what has one number per model."""
     pairs = []
     for label, suffix in (("GCE", ""), ("GCE normalised", "_normalized")):
         base, adapted = report.gce[f"base{suffix}"], report.gce[f"adapted{suffix}"]
         change = relative_change(base, adapted)
-        pairs.append((label, (base, adapted, (change, change < 0), None)))
-    return pairs
-
-
-def _surface_pairs(report: GiftIReport) -> list[tuple[str, tuple]]:
-    pairs = []
+        pairs.append((label, [base, adapted, (change, change < 0), None]))
     for surface, entry in report.by_surface.items():
-        base, own, consensus = (entry[name] and entry[name]["tom"] for name in ("base", "summary", "consensus"))
-        adapted = own if report.adapted else None
-        change = _change("rmse", base, adapted) if base and adapted else (math.nan, False)
-        values = [entry and entry["rmse"] for entry in (base, adapted, consensus)]
-        label = f"{surface} ({_count(entry['num_images'], 'image')})"
-        pairs.append((label, (values[0], values[1], change, values[2])))
+        models = (entry["base"], entry["summary"] if report.adapted else None, entry["consensus"])
+        base, adapted, consensus = (model and model["tom"]["rmse"] for model in models)
+        change = relative_change(base, adapted)
+        pairs.append(
+            (f"ToM RMSE, {surface} ({entry['num_images']})", [base, adapted, (change, change < 0), consensus])
+        )
     return pairs
 
 
@@ -195,22 +185,20 @@ def _notes(report: GiftIReport) -> list[str]:
     return notes
 
 
-def _text_cell(cell, color: bool, width: int = 13) -> str:
-    if not isinstance(cell, tuple):
-        return f"{number(cell):>{width - 1}} "
+def _text_line(label: str, cells: list, color: bool, indent: int) -> str:
+    return (f"{label:{indent}}" + "".join(_text_cell(cell, color) for cell in cells)).rstrip()
+
+
+def _text_cell(cell, color: bool) -> str:
+    """13 columns, the last of them for the mark of an improvement."""
+    if isinstance(cell, str):
+        return f"{cell:>12} "
+    if not isinstance(cell, tuple) or math.isnan(cell[0]):
+        return f"{'-' if isinstance(cell, tuple) else number(cell):>12} "
     change, better = cell
-    if math.isnan(change):
-        return f"{'-':>{width - 1}} "
-    text = f"{f'{change:+.1f} %':>{width - 1}}{'*' if better else ' '}"
-    return _paint(text, GREEN if better else RED, color and change != 0)
-
-
-def _text_pair(label: str, pair: tuple, color: bool) -> str:
-    base, adapted, change, consensus = pair
-    line = f"{label:26}{number(base):>12}"
-    if adapted is not None:
-        line += f" -> {number(adapted):<9}{_text_cell(change, color, 11)}"
-    return (line + (f"   consensus {number(consensus)}" if consensus is not None else "")).rstrip()
+    text = f"{change:+.1f} %"
+    padding = " " * (12 - len(text))
+    return padding + _paint(text, GREEN if better else RED, color and change != 0) + ("*" if better else " ")
 
 
 def _markdown_cell(cell) -> str:

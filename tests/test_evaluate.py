@@ -1,0 +1,483 @@
+"""`evaluate_gift_i` on groups whose predictions are known to the pixel, and end to end on a tiny raw tree."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from accelerate import debug_launcher
+from PIL import Image
+from tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
+
+from gift_peft.adapters import get_gift_model
+from gift_peft.data.gift_i import load_gift_i
+from gift_peft.data.preprocess import Group
+from gift_peft.data.writer import write_gift_i
+from gift_peft.evaluation.evaluate import evaluate_gift_i, make_panel, run_evaluation
+from gift_peft.evaluation.results import REGIONS, GiftIReport
+from gift_peft.evaluation.scoring import consensus
+from gift_peft.training.teacher import make_proxies
+
+H, W = 6, 8
+
+
+def base_of(pixel_values):
+    """The base reads its prediction from channel 0, the adapted model from channel 1."""
+    return pixel_values[:, 0]
+
+
+def adapted_of(pixel_values):
+    return pixel_values[:, 1]
+
+
+def make_group(seed, count=3, surface=None, valid=False, reference=True) -> Group:
+    rng = np.random.default_rng(seed)
+    pictures = torch.from_numpy(rng.uniform(0.5, 3, (count, 3, H, W)).astype(np.float32))
+    mask = torch.from_numpy(rng.random((count, H, W)) < 0.4)
+    target = torch.from_numpy(rng.uniform(-0.1, 3, (H, W)).astype(np.float32))
+    return Group(
+        group_id=f"group-{seed}",
+        names=[f"{index}.png" for index in range(count)],
+        pixel_values=pictures,
+        mask=mask,
+        valid=torch.from_numpy(rng.random((count, H, W)) < 0.8) if valid else None,
+        reference_target=target if reference else None,
+        surface=surface,
+    )
+
+
+def evaluate(groups, model=adapted_of, teacher=base_of, **options):
+    return evaluate_gift_i(groups, model, teacher, progress=False, **options)
+
+
+def oracle(prediction, reference, mask, valid):
+    """Metrics of one image, from the paper's equations, pixel by pixel."""
+    use = [(r, c) for r in range(H) for c in range(W) if valid[r, c] and reference[r, c] > 0]
+    columns = np.array([[float(prediction[p]), 1.0] for p in use])
+    scale, shift = np.linalg.lstsq(columns, np.array([float(reference[p]) for p in use]), rcond=None)[0]
+    result = {}
+    for region in REGIONS:
+        pairs = [
+            (scale * float(prediction[p]) + shift, float(reference[p]))
+            for p in use
+            if region == "all" or bool(mask[p]) == (region == "tom")
+        ]
+        result[region] = {
+            "mae": sum(abs(d - y) for d, y in pairs) / len(pairs),
+            "abs_rel": sum(abs(d - y) / y for d, y in pairs) / len(pairs),
+            "rmse": (sum((d - y) ** 2 for d, y in pairs) / len(pairs)) ** 0.5,
+            "delta1": 100 * sum(d > 0 and max(d / y, y / d) < 1.25 for d, y in pairs) / len(pairs),
+        }
+    return result
+
+
+def median_of_targets(prediction, region):
+    result = prediction.clone()
+    for row in range(H):
+        for column in range(W):
+            seen = [float(prediction[i, row, column]) for i in range(len(prediction)) if region[i, row, column]]
+            for i in range(len(prediction)):
+                if region[i, row, column]:
+                    result[i, row, column] = sorted(seen)[len(seen) // 2] / 2 + sorted(seen)[(len(seen) - 1) // 2] / 2
+    return result
+
+
+def gce_by_pairs(prediction, region):
+    """Eqs. 1-3, pair by pair."""
+    errors = []
+    for i in range(len(prediction)):
+        for j in range(i):
+            both = region[i] & region[j]
+            if both.any():
+                errors.append(float((prediction[i] - prediction[j]).double().abs()[both].mean()))
+    return sum(errors) / len(errors)
+
+
+@pytest.mark.parametrize("valid", [False, True])
+def test_rows_and_summaries_against_straight_line_code(valid):
+    groups = [make_group(seed, count, valid=valid) for seed, count in ((0, 2), (1, 3), (2, 5))]
+    report = evaluate(groups)
+    rows = iter(report.rows)
+    expected = {"base": [], "adapted": [], "consensus": []}
+    for group in groups:
+        everywhere = torch.ones_like(group.mask) if group.valid is None else group.valid
+        predictions = {"base": group.pixel_values[:, 0], "adapted": group.pixel_values[:, 1]}
+        predictions["consensus"] = median_of_targets(predictions["base"], group.mask & everywhere)
+        for index, name in enumerate(group.names):
+            row = next(rows)
+            assert (row["group_id"], row["image"], row["skipped"]) == (group.group_id, name, None)
+            assert row["target_pixels"] == int((group.mask & everywhere)[index].sum())
+            for model, prediction in predictions.items():
+                found = oracle(prediction[index], group.reference_target, group.mask[index], everywhere[index])
+                for region in REGIONS:
+                    assert row[model][region] == pytest.approx(found[region], rel=1e-5)
+                expected[model].append(found)
+    for model, summary in (("base", report.base), ("adapted", report.summary), ("consensus", report.consensus)):
+        for region in REGIONS:
+            for metric, value in summary[region].items():
+                assert value == pytest.approx(np.mean([found[region][metric] for found in expected[model]]), rel=1e-5)
+    assert report.counts == {
+        "groups": 3,
+        "images": 10,
+        "scored": 10,
+        "skipped": 0,
+        "reasons": {},
+        "without_tom": 0,
+    }
+
+
+@pytest.mark.parametrize("valid", [False, True])
+def test_gce_against_a_loop_over_pairs(valid):
+    groups = [make_group(seed, valid=valid) for seed in range(3)]
+    gce = evaluate(groups).gce
+    for channel, model in enumerate(("base", "adapted")):
+        values, normalized = [], []
+        for group in groups:
+            everywhere = torch.ones_like(group.mask) if group.valid is None else group.valid
+            value = gce_by_pairs(group.pixel_values[:, channel], group.mask & everywhere)
+            spread = np.subtract(*np.percentile(group.pixel_values[:, channel][everywhere], (95, 5)))
+            values.append(value)
+            normalized.append(value / spread)
+        assert gce[model] == pytest.approx(np.mean(values), rel=1e-5)
+        assert gce[f"{model}_normalized"] == pytest.approx(np.mean(normalized), rel=1e-5)
+    assert (gce["num_groups"], gce["num_skipped"]) == (3, 0)
+
+
+def test_groups_without_a_pair_are_left_out_of_gce_and_counted():
+    single = make_group(0, count=1)
+    apart = make_group(1, count=2)
+    apart.mask = torch.stack([apart.mask[0], ~apart.mask[0]])
+    report = evaluate([single, apart, make_group(2)])
+    assert (report.gce["num_groups"], report.gce["num_skipped"]) == (1, 2)
+    assert report.gce["base"] == pytest.approx(evaluate([make_group(2)]).gce["base"])
+    assert report.counts["scored"] == 6
+    assert math.isnan(evaluate([single]).gce["adapted"])
+
+
+def test_consensus_is_the_median_inside_the_target_only():
+    prediction = torch.arange(4.0)[:, None, None] * torch.ones(4, 1, 2) + torch.tensor([0.0, 10.0])
+    mask = torch.tensor([True, True, True, False])[:, None, None] & torch.tensor([True, False])
+    assert consensus(prediction, mask).tolist() == [[[1, 10]], [[1, 11]], [[1, 12]], [[3, 13]]]
+    valid = torch.tensor([True, True, False, True])[:, None, None].expand(4, 1, 2)
+    assert consensus(prediction, mask, valid).tolist() == [[[0.5, 10]], [[0.5, 11]], [[2, 12]], [[3, 13]]]
+    nowhere = torch.zeros_like(mask)
+    assert torch.equal(consensus(prediction, nowhere), prediction)
+
+
+def test_order_of_groups_does_not_matter():
+    groups = [make_group(seed, surface="mirror" if seed % 2 else "transparent") for seed in range(5)]
+    first, second = evaluate(groups), evaluate([groups[index] for index in (3, 1, 4, 0, 2)])
+    assert first.summary == second.summary and first.consensus == second.consensus
+    assert first.gce == second.gce and first.collapse == second.collapse and first.by_surface == second.by_surface
+
+
+def test_affine_changes_of_the_adapted_model_change_nothing_but_collapse_and_gce():
+    groups = [make_group(seed) for seed in range(2)]
+    first = evaluate(groups)
+    second = evaluate(groups, lambda pixels: 0.25 * pixels[:, 1] + 0.1)
+    for region in REGIONS:
+        assert second.summary[region] == pytest.approx(first.summary[region], rel=1e-4)
+    assert second.gce["adapted"] == pytest.approx(0.25 * first.gce["adapted"], rel=1e-4)
+    assert second.gce["adapted_normalized"] == pytest.approx(first.gce["adapted_normalized"], rel=1e-4)
+    assert second.collapse["spread_ratio"] == pytest.approx(0.25 * first.collapse["spread_ratio"], rel=1e-4)
+    assert second.collapse["alarm"] and not first.collapse["alarm"]
+
+
+@pytest.mark.parametrize(("factor", "alarm"), [(0.45, True), (0.55, False), (1.9, False), (2.1, True)])
+def test_collapse_alarm_is_outside_half_to_twice(factor, alarm):
+    report = evaluate([make_group(0)], lambda pixels: factor * pixels[:, 0])
+    assert report.collapse["target_mean_ratio"] == pytest.approx(factor, rel=1e-5)
+    assert report.collapse["spread_ratio"] == pytest.approx(factor, rel=1e-5)
+    assert report.collapse["alarm"] is alarm
+
+
+def test_a_constant_prediction_is_skipped_counted_and_raises_the_alarm():
+    report = evaluate([make_group(0), make_group(1)], lambda pixels: 1.5 + 0 * pixels[:, 0])
+    assert report.counts["reasons"] == {"with a constant adapted prediction": 6}
+    assert math.isnan(report.summary["tom"]["rmse"]) and report.base["tom"]["rmse"] > 0
+    assert report.collapse["spread_ratio"] == 0 and report.collapse["alarm"]
+    assert report.gce["adapted"] == 0
+
+
+def test_missing_references_and_empty_targets_are_counted_not_averaged():
+    blind, clear = make_group(0, reference=False), make_group(1)
+    clear.mask[0] = False
+    report = evaluate([blind, clear])
+    assert report.counts["reasons"] == {"without a treated reference": 3}
+    assert (report.counts["scored"], report.counts["skipped"], report.counts["without_tom"]) == (3, 3, 1)
+    tom = [row["adapted"]["tom"]["mae"] for row in report.rows]
+    assert [math.isnan(value) for value in tom] == [True] * 4 + [False] * 2
+    assert report.summary["tom"]["mae"] == pytest.approx(np.mean(tom[4:]))
+    assert report.gce["num_groups"] == 2
+
+
+def test_without_references_there_is_gce_alone():
+    report = evaluate([make_group(0, reference=False)])
+    assert report.gce["adapted"] > 0 and math.isnan(report.summary["all"]["mae"]) and report.counts["scored"] == 0
+
+
+def test_surfaces_have_their_own_summaries():
+    groups = [make_group(0, surface="mirror"), make_group(1, count=2, surface="transparent"), make_group(2)]
+    report = evaluate(groups)
+    assert list(report.by_surface) == ["mirror", "transparent", "unknown"]
+    for group, entry in zip(groups, report.by_surface.values(), strict=True):
+        alone = evaluate([group])
+        assert entry["num_images"] == len(group.names)
+        assert (entry["summary"], entry["base"], entry["consensus"]) == (alone.summary, alone.base, alone.consensus)
+
+
+def test_the_base_alone_and_the_model_alone():
+    alone = evaluate([make_group(0)], base_of, None)
+    both = evaluate([make_group(0)])
+    assert not alone.adapted and alone.collapse is None and alone.gce["adapted"] is None
+    assert alone.summary == alone.base == both.base and alone.consensus == both.consensus
+    quick = evaluate([make_group(0)], baseline=False)
+    assert quick.adapted and quick.base is quick.consensus is quick.collapse is None
+    assert quick.summary == both.summary and quick.gce["adapted"] == both.gce["adapted"]
+
+
+def test_groups_are_cut_in_image_order():
+    calls = []
+
+    def model(pixels):
+        calls.append(pixels[:, 2, 0, 0].tolist())
+        return pixels[:, 0]
+
+    group = make_group(0, count=5)
+    group.pixel_values[:, 2] = torch.arange(5.0)[:, None, None]
+    evaluate([group], model, None)
+    assert calls == [[0, 1], [2, 3], [4]]
+
+
+def test_bad_predictions_and_arguments_are_named():
+    group = make_group(0)
+    with pytest.raises(ValueError, match=r"group group-0: the adapted prediction of 1\.png .*NaN"):
+        evaluate([group], lambda pixels: torch.where(pixels[:, 1] == pixels[1, 1, 0, 0], torch.nan, pixels[:, 1]),
+                 batch_size=3)  # fmt: skip
+    with pytest.raises(ValueError, match="the adapted model predicts 6x7 for images of 6x8"):
+        evaluate([group], lambda pixels: pixels[:, 1, :, 1:])
+    with pytest.raises(ValueError, match="unknown reference 'gt': choose one of proxy, depth"):
+        evaluate([group], reference="gt")
+    with pytest.raises(ValueError, match="unknown protocol 'mine'"):
+        evaluate([group], protocol="mine")
+    with pytest.raises(ValueError, match="kind="):
+        evaluate([group], protocol="gift")
+    with pytest.raises(ValueError, match="needs a model"):
+        evaluate_gift_i([group])
+    with pytest.raises(ValueError, match="no groups"):
+        evaluate([])
+    with pytest.raises(ValueError, match="no group of the dataset has true depth"):
+        evaluate([group], reference="depth", kind="depth")
+
+
+# ---- true depth ----
+
+
+def depth_tree(folder, size, seed=0):
+    """A prepared validation split of one group of two pictures with true depth in mm; 0 in a corner."""
+    rng = np.random.default_rng(seed)
+    depths = rng.integers(500, 5000, (2, *size)).astype(np.uint16)
+    depths[:, 0, 0] = 0
+    masks = [np.pad(np.ones((size[0] - 4, size[1] - 4), bool), 2)] * 2
+    images = [Image.fromarray(rng.integers(0, 255, (*size, 3), dtype=np.uint8)) for _ in range(2)]
+    group = {"split": "validation", "group_id": "g", "images": images, "masks": masks, "depths": list(depths)}
+    write_gift_i([group | {"surface": "mirror"}], folder, license="cc0-1.0")
+    return load_gift_i(folder, "validation"), depths
+
+
+def test_a_perfect_disparity_model_has_no_error_against_depth(tmp_path):
+    dataset, depths = depth_tree(tmp_path, SIZE)
+    disparity = torch.from_numpy(7000.0 / np.maximum(depths, 1).astype(np.float64) + 3).float()
+    report = evaluate(
+        dataset, lambda pixels: disparity, None, reference="depth", kind="inverse_depth", processor=tiny_processor(),
+        size=SIZE,
+    )  # fmt: skip
+    assert report.protocol["name"] == "gift" and report.unit == "mm"
+    for region in REGIONS:
+        assert report.summary[region]["rmse"] < 0.5 and report.summary[region]["delta1"] == 100
+    wrong = evaluate(
+        dataset, lambda pixels: disparity, None, reference="depth", kind="depth", processor=tiny_processor(), size=SIZE
+    )
+    assert wrong.summary["all"]["rmse"] > 100
+
+
+def test_depth_is_scored_on_its_own_grid_with_the_masks_drawn_there(tmp_path):
+    dataset, depths = depth_tree(tmp_path, (30, 40))
+    small = torch.rand(2, *SIZE, generator=torch.Generator().manual_seed(0)) + 1
+    report = evaluate(
+        dataset, lambda pixels: small, None, reference="depth", kind="depth", processor=tiny_processor(), size=SIZE
+    )
+    row = report.rows[1]
+    assert row["target_pixels"] == 26 * 36
+    resized = bilinear(small[1].double().numpy(), (30, 40))
+    known = depths[1] > 0
+    columns = np.stack([resized[known], np.ones(known.sum())], 1)
+    scale, shift = np.linalg.lstsq(columns, depths[1][known].astype(float), rcond=None)[0]
+    error = np.abs(np.clip(scale * resized + shift, 1, 10000) - depths[1])
+    assert row["base"]["all"]["mae"] == pytest.approx(error[known].mean(), rel=1e-6)
+    assert row["base"]["tom"]["mae"] == pytest.approx(error[2:-2, 2:-2].mean(), rel=1e-6)
+
+
+def bilinear(image, size):
+    """Pixel centres, no corner alignment, clamped at the border."""
+    axes = []
+    for old, new in zip(image.shape, size, strict=True):
+        position = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
+        low = np.floor(position).astype(int)
+        axes.append((low, np.minimum(low + 1, old - 1), position - low))
+    (top, bottom, v), (left, right, u) = axes
+    upper = image[top][:, left] * (1 - u) + image[top][:, right] * u
+    lower = image[bottom][:, left] * (1 - u) + image[bottom][:, right] * u
+    return upper * (1 - v)[:, None] + lower * v[:, None]
+
+
+# ---- end to end on the tiny model ----
+
+
+@pytest.fixture
+def adapter_model(base_dir):
+    from transformers import AutoModelForDepthEstimation
+
+    torch.manual_seed(0)
+    return get_gift_model(AutoModelForDepthEstimation.from_pretrained(base_dir), rank=2)
+
+
+def shake(model):
+    """Give every trainable weight of an adapter a small random change."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for weight in model.parameters():
+            if weight.requires_grad:
+                weight += 0.02 * torch.randn(weight.shape, generator=generator)
+    return model
+
+
+def test_an_identity_adapter_is_the_base_to_the_bit(raw_tree, adapter_model):
+    report = evaluate_gift_i(load_gift_i(raw_tree, "validation"), adapter_model, size=SIZE, progress=False)
+    assert report.summary == report.base
+    assert report.gce["adapted"] == report.gce["base"] > 0
+    assert report.collapse == {"target_mean_ratio": 1, "spread_ratio": 1, "alarm": False}
+    assert all(row["base"] == row["adapted"] for row in report.rows)
+
+
+def test_stored_proxies_and_those_made_on_the_way_agree(raw_tree, base_dir, adapter_model):
+    shake(adapter_model)
+    made = evaluate_gift_i(load_gift_i(raw_tree, "validation"), adapter_model, size=SIZE, progress=False)
+    make_proxies(base_dir, raw_tree, splits=["validation"], size=SIZE)
+    stored = load_gift_i(raw_tree, "validation", teacher=base_dir)
+    assert evaluate_gift_i(stored, adapter_model, progress=False).to_dict() == made.to_dict()
+    assert made.summary != made.base
+    stored_base = evaluate_gift_i(stored, tiny_model(), processor=tiny_processor(), progress=False)
+    assert stored_base.base == made.base
+
+
+def test_modes_and_gradients_are_left_as_they_were(raw_tree, adapter_model):
+    adapter_model.train()
+    adapter_model.base_model.model.head.eval()
+    frozen = next(weight for name, weight in adapter_model.named_parameters() if "lora_A" in name)
+    frozen.requires_grad_(False)
+    modes = [module.training for module in adapter_model.modules()]
+    flags = [weight.requires_grad for weight in adapter_model.parameters()]
+    evaluate_gift_i(
+        load_gift_i(raw_tree, "validation"), adapter_model, processor=tiny_processor(), size=SIZE, progress=False
+    )
+    assert [module.training for module in adapter_model.modules()] == modes
+    assert [weight.requires_grad for weight in adapter_model.parameters()] == flags
+
+
+def test_the_train_split_has_gce_and_no_accuracy(raw_tree, adapter_model):
+    report = evaluate_gift_i(load_gift_i(raw_tree, "train"), shake(adapter_model), size=SIZE, progress=False)
+    assert report.gce["num_groups"] == 2 and report.counts["scored"] == 0 and report.counts["images"] == 5
+
+
+def test_run_evaluation_prints_and_writes(raw_tree, base_dir, tmp_path, adapter_model, capsys):
+    from gift_peft.adapters import save_adapter
+
+    adapter = tmp_path / "adapter"
+    with pytest.warns(UserWarning, match="local"):
+        save_adapter(shake(adapter_model), adapter, str(base_dir), processor=tiny_processor(), size=SIZE)
+    out = tmp_path / "out"
+    report = run_evaluation(base_dir, raw_tree, adapter, out=out, progress=False)
+    printed = capsys.readouterr().out
+    assert (
+        "ToM   base" in printed and "consensus" in printed and "Protocol native" in printed and "\x1b" not in printed
+    )
+    assert {path.name for path in out.iterdir()} == {"metrics.json", "rows.jsonl", "report.md"}
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["summary"] == report.summary and metrics["about"]["size"] == list(SIZE)
+    rows = [json.loads(line) for line in (out / "rows.jsonl").read_text().splitlines()]
+    assert rows == report.rows and len(rows) == 2
+    same = run_evaluation(base_dir, raw_tree, adapter, adapter_scale=0, out=out, progress=False)
+    assert same.summary == same.base == report.base
+
+
+def test_saved_reports_hold_no_nan_and_load_again(tmp_path):
+    report = evaluate([make_group(0), make_group(1, reference=False), make_group(2, count=1)])
+    folder = report.save(tmp_path / "deep" / "folder")
+
+    def refuse(name):
+        raise AssertionError(f"{name} in JSON")
+
+    for line in [(folder / "metrics.json").read_text(), *(folder / "rows.jsonl").read_text().splitlines()]:
+        json.loads(line, parse_constant=refuse)
+    loaded = GiftIReport.load(folder)
+    assert loaded.to_dict() == report.to_dict() and len(loaded.rows) == len(report.rows)
+    assert loaded.rows[3]["base"]["all"]["mae"] is None
+    assert {path.name for path in folder.iterdir()} == {"metrics.json", "rows.jsonl"}
+    with pytest.raises(FileNotFoundError, match=r"metrics\.json is missing"):
+        GiftIReport.load(tmp_path)
+
+
+def _evaluate_in_two_processes(raw, out):
+    from accelerate import Accelerator
+    from accelerate.state import AcceleratorState
+
+    AcceleratorState._reset_state(reset_partial_state=True)  # the parent's tests may have made one before the fork
+    accelerator = Accelerator(cpu=True)
+    model = shake_alone()
+    report = evaluate_gift_i(
+        load_gift_i(raw, "validation"),
+        model,
+        processor=tiny_processor(),
+        size=SIZE,
+        accelerator=accelerator,
+        progress=False,
+    )
+    report.save(out / str(accelerator.process_index))
+
+
+def shake_alone():
+    torch.manual_seed(0)
+    return shake(get_gift_model(tiny_model(), rank=2, head="none"))
+
+
+def test_two_processes_give_the_report_of_one(tmp_path):
+    raw = write_raw_tree(tmp_path / "raw", validation=(2, 3, 2))
+    debug_launcher(_evaluate_in_two_processes, (raw, tmp_path), num_processes=2)
+    one, two = (GiftIReport.load(tmp_path / rank) for rank in "01")
+    assert one.to_dict() == two.to_dict() and one.rows == two.rows
+    assert [row["group_id"] for row in one.rows] == [f"scene_{100 + g}" for g in (0, 0, 1, 1, 1, 2, 2)]
+    alone = evaluate_gift_i(raw, shake_alone(), processor=tiny_processor(), size=SIZE, progress=False)
+    assert alone.to_dict() == one.to_dict()
+
+
+def test_paths_and_model_ids_are_accepted(raw_tree, base_dir, tmp_path):
+    other = write_base(tmp_path / "other", seed=1)
+    from gift_peft.evaluation.predict import load_model
+
+    report = evaluate_gift_i(raw_tree, load_model(other, size=SIZE).model, str(base_dir), size=SIZE, progress=False)
+    expected = evaluate_gift_i(raw_tree, tiny_model(), processor=tiny_processor(), size=SIZE, progress=False)
+    assert report.base == expected.base and report.summary != report.base
+
+
+def test_panels_hold_an_observation_on_the_reference_grid(tmp_path):
+    dataset, depths = depth_tree(tmp_path, (30, 40))
+    options = {"processor": tiny_processor(), "size": SIZE, "kind": "inverse_depth"}
+    panel = make_panel(dataset[0], 1, tiny_model(1), tiny_model(), label="mirror", **options)
+    assert panel.base.shape == panel.adapted.shape == panel.target.shape == (30, 40)
+    np.testing.assert_array_equal(panel.reference, depths[1])
+    assert panel.image.size == (40, 30) and panel.target.sum() == 26 * 36 and panel.protocol == "gift"
+    assert not np.array_equal(panel.base, panel.adapted)
+    with pytest.raises(ValueError, match="group g has no proxy"):
+        make_panel(dataset[0], 0, tiny_model(1), tiny_model(), label="x", reference="proxy", **options)

@@ -1,0 +1,228 @@
+"""`gift-peft predict` and the loader: files written, values against transformers, and every way it can go wrong."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tiny import SIZE, tiny_model, tiny_processor, write_base
+from transformers import DepthAnythingForDepthEstimation
+
+from gift_peft.adapters import get_gift_model, save_adapter
+from gift_peft.data.proxies import teacher_revision
+from gift_peft.evaluation.colormap import GREY, color_range, colorize
+from gift_peft.evaluation.predict import load_model, predict_depth, predict_images
+
+
+@pytest.fixture(scope="module")
+def adapter_dir(tmp_path_factory, base_dir):
+    """A random adapter of the tiny base, as training would leave it."""
+    torch.manual_seed(0)
+    model = get_gift_model(load_model(base_dir, size=SIZE, device="cpu").model, rank=2)
+    with torch.no_grad():
+        for weight in model.parameters():
+            if weight.requires_grad:
+                weight += 0.02 * torch.randn_like(weight)
+    folder = tmp_path_factory.mktemp("adapter") / "adapter"
+    with pytest.warns(UserWarning, match="local"):
+        save_adapter(
+            model,
+            folder,
+            str(base_dir),
+            processor=tiny_processor(),
+            size=SIZE,
+            gift={"base_revision": teacher_revision(base_dir)},
+        )
+    return folder
+
+
+@pytest.fixture
+def photo(tmp_path):
+    path = tmp_path / "photo.png"
+    pixels = np.random.default_rng(0).integers(0, 255, (45, 61, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+def test_values_are_those_of_transformers(base_dir, photo, tmp_path):
+    (path,) = predict_images([photo], base_dir, out=tmp_path / "out", size=SIZE)
+    processor, image = tiny_processor(), Image.open(photo)
+    with torch.no_grad():
+        outputs = tiny_model()(**processor(image, return_tensors="pt"))
+    expected = processor.post_process_depth_estimation(outputs, [(45, 61)])[0]["predicted_depth"]
+    found = np.load(path)
+    assert found.shape == (45, 61) and found.dtype == np.float32
+    np.testing.assert_allclose(found, expected.numpy(), rtol=1e-5)
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["photo.npy", "photo.png"]
+
+
+def test_the_base_stands_beside_the_adapter(base_dir, adapter_dir, photo, tmp_path):
+    out = tmp_path / "out"
+    predict_images([photo], base_dir, adapter_dir, out=out)
+    assert sorted(file.name for file in out.iterdir()) == [
+        "photo.npy",
+        "photo.png",
+        "photo_base.npy",
+        "photo_base.png",
+    ]
+    predict_images([photo], base_dir, out=tmp_path / "plain", size=SIZE)
+    adapted, base = np.load(out / "photo.npy"), np.load(out / "photo_base.npy")
+    np.testing.assert_array_equal(base, np.load(tmp_path / "plain" / "photo.npy"))
+    assert not np.array_equal(adapted, base)
+    low, high = color_range(adapted, base)
+    for name, depth in (("photo", adapted), ("photo_base", base)):
+        drawn = np.asarray(Image.open(out / f"{name}.png"))
+        np.testing.assert_array_equal(drawn, colorize(depth, low, high, "inverse_depth"))
+
+
+def test_scale_zero_is_the_base_and_one_the_adapter(base_dir, adapter_dir, photo, tmp_path):
+    depths = {}
+    for scale in (None, 0, 0.5, 1):
+        predict_images([photo], base_dir, adapter_dir, scale, out=tmp_path / str(scale))
+        depths[scale] = np.load(tmp_path / str(scale) / "photo.npy")
+    np.testing.assert_array_equal(depths[0], np.load(tmp_path / "0" / "photo_base.npy"))
+    np.testing.assert_array_equal(depths[1], depths[None])
+    assert not np.array_equal(depths[0.5], depths[0]) and not np.array_equal(depths[0.5], depths[1])
+    with pytest.raises(ValueError, match="adapter_scale needs an adapter"):
+        predict_images([photo], base_dir, None, 0.5, out=tmp_path / "x", size=SIZE)
+
+
+def test_loader_takes_size_and_kind_from_where_they_are_stated(base_dir, adapter_dir, tmp_path):
+    loaded = load_model(base_dir, adapter_dir)
+    assert loaded.size == SIZE and loaded.kind == "inverse_depth" and not loaded.model.training
+    assert load_model(base_dir, adapter_dir, size="28x42").size == (28, 42)
+    assert load_model(base_dir).size == (476, 644)
+    metric = write_base(tmp_path / "metric", depth_estimation_type="metric", max_depth=10)
+    assert load_model(metric, size=SIZE).kind == "depth"
+
+
+def test_folders_duplicates_and_natural_order(base_dir, photo, tmp_path):
+    for name in ("b/10.png", "b/9.png", "c/9.png", "d/9.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.open(photo).save(tmp_path / name)
+    (tmp_path / "b" / "notes.txt").write_text("no picture")
+    paths = predict_images(
+        [tmp_path / "b", tmp_path / "c" / "9.png", tmp_path / "d"], base_dir, out=tmp_path / "out", size=SIZE
+    )
+    assert [path.name for path in paths] == ["9.npy", "10.npy", "9-2.npy", "9-3.npy"]
+    assert all(path.is_file() and path.with_suffix(".png").is_file() for path in paths)
+
+
+def test_a_picture_called_like_a_base_file_is_not_overwritten(base_dir, adapter_dir, photo, tmp_path):
+    other = tmp_path / "photo_base.png"
+    Image.open(photo).rotate(180).save(other)
+    paths = predict_images([photo, other], base_dir, adapter_dir, out=tmp_path / "out")
+    assert [path.name for path in paths] == ["photo.npy", "photo_base-2.npy"]
+    assert len(list((tmp_path / "out").iterdir())) == 8
+
+
+def test_exif_orientation_decides_the_size(base_dir, photo, tmp_path):
+    exif = Image.Exif()
+    exif[Image.ExifTags.Base.Orientation] = 6
+    turned = tmp_path / "turned.png"
+    Image.open(photo).save(turned, exif=exif)
+    (path,) = predict_images([turned], base_dir, out=tmp_path / "out", size=SIZE)
+    assert np.load(path).shape == (61, 45)
+
+
+# ---- bad input ----
+
+
+def test_missing_things_are_named(base_dir, adapter_dir, photo, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(FileNotFoundError, match=r"no such image: .*gone\.png \(and 1 more\)"):
+        predict_images([photo, "gone.png", "too.png"], base_dir, out=out)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"no images in .*empty"):
+        predict_images([tmp_path / "empty"], base_dir, out=out)
+    with pytest.raises(FileNotFoundError, match=r"base model .*nowhere"):
+        predict_images([photo], tmp_path / "nowhere", out=out)
+    with pytest.raises(FileNotFoundError, match=r"empty: the folder has no adapter_config\.json"):
+        predict_images([photo], base_dir, tmp_path / "empty", out=out)
+    with pytest.raises(FileNotFoundError, match="adapter no/such: "):
+        predict_images([photo], base_dir, "no/such", out=out)
+    assert not out.exists()
+
+
+def test_unreadable_pictures_are_named(base_dir, photo, tmp_path):
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(photo.read_bytes()[:500])
+    with pytest.raises(ValueError, match=r"broken\.png"):
+        predict_images([broken], base_dir, out=tmp_path / "out", size=SIZE)
+
+
+def test_an_adapter_for_other_weights_is_refused(adapter_dir, base_dir, tmp_path):
+    other = write_base(tmp_path / "other", seed=1)
+    with pytest.raises(ValueError, match=r"adapter .* was trained on .*, whose files are not those of base .*other"):
+        load_model(other, adapter_dir)
+    moved = shutil.copytree(base_dir, tmp_path / "moved")
+    assert load_model(moved, adapter_dir).size == SIZE
+
+
+def test_an_adapter_for_other_shapes_or_layers_is_refused(adapter_dir, base_dir, tmp_path):
+    silent = shutil.copytree(adapter_dir, tmp_path / "silent")
+    (silent / "gift.json").unlink()
+    wide = shutil.copytree(base_dir, tmp_path / "wide")
+    config = tiny_model().config
+    config.fusion_hidden_size = 8
+    DepthAnythingForDepthEstimation(config).save_pretrained(wide)
+    with pytest.raises(ValueError, match=r"adapter .*silent does not fit base .*wide: it was trained on") as error:
+        load_model(wide, silent)
+    assert "\n" not in str(error.value)
+    config = json.loads((silent / "adapter_config.json").read_text())
+    (silent / "adapter_config.json").write_text(json.dumps(config | {"target_modules": r".*\.(fc1|fc2)"}))
+    with pytest.raises(ValueError, match=r"does not fit base .*missing adapter keys"):
+        load_model(base_dir, silent)
+
+
+def test_an_adapter_of_another_hub_id_is_refused(adapter_dir, base_dir, tmp_path, monkeypatch):
+    from gift_peft.evaluation import predict
+
+    hub = shutil.copytree(adapter_dir, tmp_path / "hub")
+    config = json.loads((hub / "adapter_config.json").read_text())
+    (hub / "adapter_config.json").write_text(json.dumps(config | {"base_model_name_or_path": "org/model-a"}))
+    (hub / "gift.json").write_text(json.dumps({"base_revision": "0123abc"}))
+    monkeypatch.setattr(predict, "teacher_revision", lambda base, revision: "4567def")
+    with pytest.raises(ValueError, match=r"was trained on org/model-a, not on base org/model-b"):
+        predict._check_base("org/model-b", None, hub, "org/model-a")
+    predict._check_base("org/model-a", None, hub, "org/model-a")
+    monkeypatch.undo()
+    assert load_model(base_dir, hub).size == SIZE  # a local copy of the hub's model
+
+
+def test_nan_predictions_are_errors_that_name_the_picture(base_dir, photo, tmp_path):
+    base = shutil.copytree(base_dir, tmp_path / "nan")
+    model = tiny_model()
+    with torch.no_grad():
+        model.head.conv3.bias.fill_(torch.nan)
+    model.save_pretrained(base)
+    with pytest.raises(ValueError, match=r"photo\.png: the prediction has NaN"):
+        predict_images([photo], base, out=tmp_path / "out", size=SIZE)
+
+
+# ---- small pieces ----
+
+
+def test_predict_depth_takes_modules_and_functions_and_leaves_no_graph(model):
+    pixels = torch.randn(3, 3, *SIZE, generator=torch.Generator().manual_seed(0))
+    found = predict_depth(model, pixels)
+    assert found.shape == (3, *SIZE) and not found.requires_grad
+    with torch.no_grad():
+        np.testing.assert_array_equal(found[2].numpy(), model(pixel_values=pixels[2:]).predicted_depth[0].numpy())
+    assert torch.equal(predict_depth(lambda x: x[:, 0], pixels), pixels[:, 0])
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(predict_depth(model, pixels), found)
+
+
+def test_colours_near_is_bright_and_unknown_is_grey():
+    depth = np.array([[1.0, 2.0, 4.0, np.nan]])
+    as_depth, as_disparity = (colorize(depth, 1, 4, kind)[0].astype(int) for kind in ("depth", "inverse_depth"))
+    assert as_depth[0].sum() > as_depth[1].sum() > as_depth[2].sum()
+    assert as_disparity[0].sum() < as_disparity[1].sum() < as_disparity[2].sum()
+    assert tuple(as_depth[3]) == tuple(as_disparity[3]) == GREY
+    assert (colorize(np.ones((2, 2)), 1, 1, "depth") == colorize(np.ones((2, 2)), 1, 2, "depth")).all()
+    # Lightness rises along the whole map: readable without colour.
+    ramp = colorize(np.linspace(0, 1, 256)[None], 0, 1, "inverse_depth")[0] @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(ramp) > -0.5).all() and ramp[-1] > 4 * ramp[0]

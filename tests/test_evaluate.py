@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -481,3 +482,34 @@ def test_panels_hold_an_observation_on_the_reference_grid(tmp_path):
     assert not np.array_equal(panel.base, panel.adapted)
     with pytest.raises(ValueError, match="group g has no proxy"):
         make_panel(dataset[0], 0, tiny_model(1), tiny_model(), label="x", reference="proxy", **options)
+
+
+CLEARGRASP = Path(__file__).parents[2] / "shared" / "data" / "cleargrasp_d435"
+
+
+@pytest.mark.skipif(not CLEARGRASP.is_dir(), reason="the ClearGrasp sample scenes are not beside the repository")
+def test_real_scenes_with_a_treated_reference_and_measured_depth(tmp_path):
+    scenes = [folder for folder in sorted(CLEARGRASP.iterdir()) if folder.is_dir()]
+    groups = [
+        {
+            "split": "validation",
+            "group_id": scene.name,
+            "surface": "transparent",
+            "images": [scene / "transparent.jpg"],
+            "masks": [scene / "mask.png"],
+            "depths": [scene / "opaque_depth_mm.png"],
+            "reference": scene / "opaque_sprayed.jpg",
+        }
+        for scene in scenes
+    ]
+    write_gift_i(groups, tmp_path, license="other")
+    dataset = load_gift_i(tmp_path, "validation")
+    options = {"processor": tiny_processor(), "size": SIZE, "progress": False}
+    for reference, protocol in (("proxy", "native"), ("depth", "gift")):
+        report = evaluate_gift_i(dataset, tiny_model(1), tiny_model(), reference=reference, **options)
+        assert report.protocol["name"] == protocol and report.counts["scored"] == 2
+        assert (report.gce["num_groups"], report.gce["num_skipped"]) == (0, 2)
+        # With one observation the median is the observation itself.
+        assert report.consensus == report.base and report.summary != report.base
+    assert 10 < report.base["all"]["mae"] < 1000  # mm, of scenes less than two metres deep
+    assert report.rows[0]["target_pixels"] == int((np.asarray(dataset[0]["masks"][0]) > 0).sum())

@@ -162,6 +162,8 @@ def test_a_consensus_no_better_than_the_base_is_said(table):
         assert consensus_teaches(bad) is False and NO_TEACHING in text(bad)
     unknown = make_report(consensus={**good.consensus, "tom": metrics(*[None] * 4)})
     assert consensus_teaches(unknown) is None and NO_TEACHING not in text(unknown)
+    single = make_report(consensus=good.base, gce=good.gce | {"num_groups": 0})
+    assert consensus_teaches(single) is None and NO_TEACHING not in text(single)
 
 
 @pytest.mark.parametrize("table", [text_table, markdown_table])

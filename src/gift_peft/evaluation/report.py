@@ -42,8 +42,11 @@ def improved(metric: str, change: float) -> bool:
 
 
 def consensus_teaches(report: GiftIReport) -> bool | None:
-    """Whether the consensus beats the base inside the target, by RMSE; None where it is not known."""
-    if not report.consensus or not report.base:
+    """Whether the consensus beats the base inside the target, by RMSE; None where that is not known.
+
+    It is not where no group has two observations of a target pixel: the median of one is that one.
+    """
+    if not report.consensus or not report.base or not report.gce["num_groups"]:
         return None
     base, consensus = report.base["tom"]["rmse"], report.consensus["tom"]["rmse"]
     if base is None or consensus is None or math.isnan(base) or math.isnan(consensus):
@@ -258,16 +261,11 @@ def _draw_row(panel: Panel) -> Image.Image:
     maps = [colorize(depth, low, high, "depth" if in_depth else panel.kind) for depth in (reference, *aligned)]
     height = round(TILE_WIDTH * panel.reference.shape[0] / panel.reference.shape[1])
     strip = Image.new("RGB", (GAP + 4 * (TILE_WIDTH + GAP), CAPTION + height + GAP), "white")
-    errors = [number(depth_metrics(depth, panel.reference, panel.target)["rmse"]) for depth in aligned]
-    unit = " mm" if in_depth else ""
-    caption = f"{panel.label}   RMSE in the target: {errors[0]} → {errors[1]}{unit}"
-    ImageDraw.Draw(strip).text(
-        (GAP, CAPTION // 2),
-        f"{caption}   (colours {number(low)} to {number(high)}{unit})",
-        fill="black",
-        font=ImageFont.load_default(size=17),
-        anchor="lm",
-    )
+    errors = [depth_metrics(depth, panel.reference, panel.target)["rmse"] for depth in aligned]
+    before, after, near, far = (f"{v:.0f} mm" if in_depth else f"{v:.3g}" for v in (*errors, low, high))
+    caption = f"{panel.label}   RMSE in the outline: {before} before, {after} after   (colours {near} to {far})"
+    font = ImageFont.load_default(size=17)
+    ImageDraw.Draw(strip).text((GAP, CAPTION // 2), caption, fill="black", font=font, anchor="lm")
     for index, picture in enumerate((panel.image, *map(Image.fromarray, maps))):
         tile = np.asarray(picture.convert("RGB").resize((TILE_WIDTH, height), Image.Resampling.BICUBIC))
         strip.paste(Image.fromarray(_outline(tile, panel.target)), (GAP + index * (TILE_WIDTH + GAP), CAPTION))

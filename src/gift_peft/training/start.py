@@ -14,7 +14,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from accelerate import Accelerator, PartialState
-from accelerate.utils import ProjectConfiguration
+from accelerate.state import AcceleratorState
+from accelerate.utils import ProjectConfiguration, parse_flag_from_env
 
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.card import check_push
@@ -25,12 +26,13 @@ RUN_FILES = ("config.yaml", "metrics.jsonl", "adapter", "adapter-last", "logs")
 
 def make_accelerator(args: GiftTrainingArguments) -> Accelerator:
     """Device, processes, mixed precision (the argument, else accelerate's setting, else bf16 on CUDA) and tracker."""
-    on_cuda = PartialState().device.type == "cuda"
+    on_cuda = PartialState(cpu=parse_flag_from_env("ACCELERATE_USE_CPU")).device.type == "cuda"
     precision = args.mixed_precision or os.environ.get("ACCELERATE_MIXED_PRECISION") or ("bf16" if on_cuda else "no")
     if precision not in ("no", "bf16"):
         raise ValueError(f"mixed_precision: {precision} (accelerate's setting) is not supported; use bf16 or no")
     if args.report_to != "none" and find_spec(args.report_to) is None:
         raise ValueError(f"report_to: {args.report_to} is not installed; pip install {args.report_to}")
+    AcceleratorState._reset_state()  # an earlier run of this process (a notebook) may have had another precision
     logs = Path(args.output_dir) / "logs"
     return Accelerator(
         mixed_precision=precision,

@@ -1,0 +1,42 @@
+"""Short training runs on the tiny tree, and what they leave on disk."""
+
+import multiprocessing
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file
+
+from gift_peft.training import GiftTrainingArguments, TrainResult, train
+
+
+def arguments(base: Path, tree: Path, out: Path, **changes) -> GiftTrainingArguments:
+    """Two epochs with a checkpoint after every update."""
+    values = {"size": "56x70", "num_train_epochs": 2, "learning_rate": 2e-4, "checkpointing_steps": 1} | changes
+    return GiftTrainingArguments(str(base), str(tree), str(out), **values)
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return load_file(folder / "adapter_model.safetensors")
+
+
+def assert_same_run(out: Path, expected: Path) -> None:
+    """Adapters, best and last, and metrics to the bit; nothing under a temporary name."""
+    for name in ("adapter", "adapter-last"):
+        ours, theirs = weights(out / name), weights(expected / name)
+        assert ours.keys() == theirs.keys()
+        assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+    assert (out / "metrics.jsonl").read_text() == (expected / "metrics.jsonl").read_text()
+    assert not list(out.glob(".*"))
+
+
+def run_in_child(function, *args) -> int:
+    """Exit code of `function(*args)` in a forked process (no new imports); negative for a signal."""
+    process = multiprocessing.get_context("fork").Process(target=function, args=args)
+    process.start()
+    process.join()
+    return process.exitcode
+
+
+def train_again(args: GiftTrainingArguments, **changes) -> TrainResult:
+    """Resume from the newest checkpoint."""
+    return train(GiftTrainingArguments(**{**vars(args), "resume_from_checkpoint": "latest", **changes}))

@@ -1,0 +1,110 @@
+"""YAML, then the command line; every wrong argument is one line that names it."""
+
+import pytest
+import yaml
+
+from gift_peft.training import GiftTrainingArguments, parse_arguments
+
+REQUIRED = ["--model_name_or_path", "m", "--dataset_name", "d", "--output_dir", "o"]
+
+
+def write(path, text):
+    path.write_text(text)
+    return ["--config", str(path)]
+
+
+def test_defaults_are_the_papers():
+    args = parse_arguments(REQUIRED)
+    assert (args.learning_rate, args.weight_decay, args.num_train_epochs) == (2e-5, 0, 50)
+    assert (args.lambda_c, args.lambda_d, args.micro_batch_size, args.lora_rank, args.head) == (1, 1, 2, 8, "full")
+
+
+def test_the_command_line_wins_over_yaml_wins_over_defaults(tmp_path):
+    config = write(tmp_path / "c.yaml", "learning_rate: 1e-3\nlora_rank: 4\ncheckpoint_at_steps: [3, 5]\nseed: 7\n")
+    args = parse_arguments([*config, *REQUIRED, "--seed", "9"])
+    assert (args.learning_rate, args.lora_rank, args.checkpoint_at_steps, args.seed) == (1e-3, 4, [3, 5], 9)
+
+
+def test_required_values_may_come_from_yaml(tmp_path):
+    config = write(tmp_path / "c.yaml", "model_name_or_path: m\ndataset_name: d\noverwrite_output_dir: true\n")
+    args = parse_arguments([*config, "--output_dir", "o"])
+    assert (args.model_name_or_path, args.overwrite_output_dir) == ("m", True)
+
+
+def test_config_yaml_of_a_run_reads_back(tmp_path):
+    args = parse_arguments([*REQUIRED, "--checkpoint_at_steps", "3", "--retain", "4", "--size", "56x70"])
+    again = parse_arguments(write(tmp_path / "c.yaml", args.to_yaml()))
+    again.config = None
+    assert again == args
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lerning_rate: 1\n", r"c\.yaml: unknown key 'lerning_rate'; did you mean learning_rate\?"),
+        ("config: other.yaml\n", "unknown key 'config'"),
+        ("lora_rank: many\n", "lora_rank.*invalid int value: 'many'"),
+        ("head: half\n", "head.*invalid choice: 'half'"),
+        ("lambda_c: {a: 1}\n", "lambda_c: expected a value"),
+        ("- 1\n", "expected lines of the form"),
+        ("a: b: c\n", "not valid YAML"),
+    ],
+)
+def test_yaml_errors_name_file_and_key(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message) as error:
+        parse_arguments([*write(tmp_path / "c.yaml", text), *REQUIRED])
+    assert "\n" not in str(error.value)
+
+
+def test_missing_config_file():
+    with pytest.raises(FileNotFoundError, match=r"config: no such file: nowhere\.yaml"):
+        parse_arguments(["--config", "nowhere.yaml", *REQUIRED])
+
+
+def test_unknown_and_missing_arguments():
+    with pytest.raises(ValueError, match=r"unknown argument --lora_rnk; did you mean lora_rank\?"):
+        parse_arguments([*REQUIRED, "--lora_rnk", "3"])
+    with pytest.raises(ValueError, match="required: --output_dir"):
+        parse_arguments(REQUIRED[:4])
+    with pytest.raises(ValueError, match="unknown argument stray"):
+        parse_arguments([*REQUIRED, "stray"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mixed_precision", "fp16"),
+        ("retain", "some"),
+        ("retain", -1),
+        ("size", "56"),
+        ("lora_rank", 0),
+        ("micro_batch_size", 0),
+        ("num_train_epochs", 0),
+        ("checkpointing_steps", 0),
+        ("max_steps", 0),
+        ("learning_rate", 0.0),
+        ("learning_rate", float("nan")),
+        ("lambda_d", -1.0),
+        ("lambda_d", float("nan")),
+        ("seed", -1),
+    ],
+)
+def test_values_out_of_range_are_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        GiftTrainingArguments("m", "d", "o", **{name: value})
+
+
+def test_resuming_and_overwriting_exclude_each_other():
+    with pytest.raises(ValueError, match="overwrite_output_dir and resume_from_checkpoint"):
+        parse_arguments([*REQUIRED, "--overwrite_output_dir", "--resume_from_checkpoint", "latest"])
+
+
+@pytest.mark.parametrize("name", ["depth_anything_v2_large", "depth_anything_v2_metric_large"])
+def test_the_example_configurations_are_the_papers_settings(name, request):
+    path = request.config.rootpath / "examples" / f"{name}.yaml"
+    args = parse_arguments(["--config", str(path)])
+    paper = GiftTrainingArguments("m", "d", "o")
+    for key in yaml.safe_load(path.read_text()):
+        if key not in ("model_name_or_path", "dataset_name", "output_dir", "size", "mixed_precision"):
+            assert getattr(args, key) == getattr(paper, key), key
+    assert (args.size, args.mixed_precision) == ("476x644", "bf16")

@@ -1,0 +1,262 @@
+"""Killed, interrupted, spread over two processes: the adapter is the one of the uninterrupted run."""
+
+import json
+import os
+import shutil
+import signal
+
+import pytest
+import torch
+from accelerate import debug_launcher
+from accelerate.state import AcceleratorState
+from runs import arguments, assert_same_run, run_in_child, train_again, weights
+from tiny import write_raw_tree
+
+from gift_peft import cli
+from gift_peft.group_step import GroupStep
+from gift_peft.training import checkpoints, loop, train
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return write_raw_tree(tmp_path_factory.mktemp("tree") / "raw")
+
+
+@pytest.fixture(scope="module")
+def whole(base_dir, tree, tmp_path_factory):
+    """An uninterrupted run of four updates."""
+    out = tmp_path_factory.mktemp("whole") / "out"
+    train(arguments(base_dir, tree, out))
+    return out
+
+
+@pytest.fixture
+def args(base_dir, tree, tmp_path):
+    return arguments(base_dir, tree, tmp_path / "out")
+
+
+def kill(*args, **kwargs):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def on_call(number, function, act):
+    """`function`, but its `number`-th call (0: every call) does `act` first."""
+    calls = []
+
+    def wrapped(*args, **kwargs):
+        calls.append(args)
+        if number in (0, len(calls)):
+            act(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return wrapped
+
+
+def half_a_file(tensors, path):
+    path.write_bytes(b"half")
+    kill()
+
+
+def renaming(name):
+    """Kills when a folder is about to get this name."""
+
+    def act(source, target):
+        if os.path.basename(target) == name:
+            kill()
+
+    return act
+
+
+# What is replaced, its name, the call at which the process dies (0: any), how, and what must lie there then.
+MOMENTS = {
+    "before the first checkpoint": (GroupStep, "accumulate", 1, kill, {"adapter": False, "checkpoint-1": False}),
+    "in the second step": (GroupStep, "accumulate", 2, kill, {"checkpoint-1": True, "checkpoint-2": False}),
+    "in the middle of writing checkpoint-3": (
+        checkpoints,
+        "save_file",
+        5,
+        half_a_file,
+        {"checkpoint-2": True, f".checkpoint-3.tmp/{checkpoints.OPTIMIZER}": True, "checkpoint-3": False},
+    ),
+    "before checkpoint-3 gets its name": (
+        os,
+        "replace",
+        0,
+        renaming("checkpoint-3"),
+        {"checkpoint-2": True, f".checkpoint-3.tmp/{checkpoints.CHECKSUMS}": True, "checkpoint-3": False},
+    ),
+    "between best adapter and metrics": (loop, "write_metrics", 2, kill, {"adapter": True, "checkpoint-2": False}),
+    "while old checkpoints are deleted": (
+        os,
+        "replace",
+        0,
+        renaming(".checkpoint-1.tmp"),
+        {"checkpoint-1": True, "checkpoint-3": True},
+    ),
+}
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_kill_and_resume_is_the_uninterrupted_run(moment, args, whole, tmp_path):
+    owner, name, number, act, left = MOMENTS[moment]
+
+    def run_and_die():
+        setattr(owner, name, on_call(number, getattr(owner, name), act))
+        train(args)
+
+    assert run_in_child(run_and_die) == -signal.SIGKILL
+    assert {name: (tmp_path / "out" / name).exists() for name in left} == left
+    train_again(args)
+    assert_same_run(tmp_path / "out", whole)
+
+
+def test_interrupted_twice_the_last_checkpoint_is_the_same_to_the_byte(args, whole, tmp_path, monkeypatch):
+    for steps in (1, 3):
+        with monkeypatch.context() as patch:
+            done = on_call(steps - steps // 2, GroupStep.accumulate, lambda *a: os.kill(os.getpid(), signal.SIGINT))
+            patch.setattr(GroupStep, "accumulate", done)
+            result = train(args)
+        assert (result.signal, result.step) == (signal.SIGINT, steps)
+        args.resume_from_checkpoint = "latest"
+    train(args)
+    assert_same_run(tmp_path / "out", whole)
+    for name in (checkpoints.OPTIMIZER, checkpoints.RNG, checkpoints.STATE):
+        assert (tmp_path / "out/checkpoint-4" / name).read_bytes() == (whole / "checkpoint-4" / name).read_bytes()
+
+
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_checkpoint_after_the_group_and_say_how_to_go_on(
+    signum, code, args, whole, tmp_path, monkeypatch, capsys
+):
+    config = tmp_path / "c.yaml"
+    config.write_text(args.to_yaml())
+    before = signal.getsignal(signum)
+    with monkeypatch.context() as patch:
+        stop = on_call(3, GroupStep.accumulate, lambda *a: os.kill(os.getpid(), signum))
+        patch.setattr(GroupStep, "accumulate", stop)
+        with pytest.raises(SystemExit) as exit:
+            cli.main(["train", "--config", str(config)])
+    assert exit.value.code == code
+    assert signal.getsignal(signum) == before
+    command = capsys.readouterr().out.strip().splitlines()[-1].split()
+    assert command[:2] == ["gift-peft", "train"]
+    assert checkpoints.checkpoint_fault(tmp_path / "out/checkpoint-3") is None
+    with pytest.raises(SystemExit) as exit:
+        cli.main(command[1:])
+    assert exit.value.code == 0
+    assert_same_run(tmp_path / "out", whole)
+
+
+def test_a_broken_newest_checkpoint_is_skipped(args, whole, tmp_path, capsys):
+    shutil.copytree(whole, tmp_path / "out")
+    shutil.rmtree(tmp_path / "out/adapter-last")
+    state = tmp_path / "out/checkpoint-4" / checkpoints.OPTIMIZER
+    state.write_bytes(state.read_bytes()[:-1])
+    (tmp_path / "out/checkpoint-9").mkdir()
+    train_again(args)
+    said = capsys.readouterr().out
+    assert "checkpoint-9, which is not complete: checksums.json is missing" in said
+    assert "checkpoint-4, which is not complete: optimizer.safetensors is damaged" in said
+    assert "Going on from" in said and "(step 3)" in said
+    assert_same_run(tmp_path / "out", whole)
+
+
+def test_only_broken_checkpoints_are_an_error(args, tmp_path):
+    (tmp_path / "out/checkpoint-2").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"no complete checkpoint in .*out"):
+        train_again(args)
+    with pytest.raises(ValueError, match=r"checkpoint-2 is not a complete checkpoint"):
+        train_again(args, resume_from_checkpoint=str(tmp_path / "out/checkpoint-2"))
+    with pytest.raises(FileNotFoundError, match="no such folder: nowhere"):
+        train_again(args, resume_from_checkpoint="nowhere")
+
+
+def test_a_checkpoint_carries_its_run_to_another_folder(args, whole, tmp_path):
+    """With the best adapter and the metrics; rows after the checkpoint are written anew."""
+    train_again(args, resume_from_checkpoint=str(whole / "checkpoint-3"))
+    assert_same_run(tmp_path / "out", whole)
+
+
+def test_a_longer_run_has_the_shorter_as_its_beginning(args, base_dir, tree, whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "out")
+    train_again(args, num_train_epochs=3)
+    longer = tmp_path / "longer"
+    train(arguments(base_dir, tree, longer, num_train_epochs=3))
+    assert_same_run(tmp_path / "out", longer)
+    assert len((longer / "metrics.jsonl").read_text().splitlines()) == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("learning_rate", 1e-3), ("seed", 5), ("lora_rank", 2), ("lambda_d", 0.5), ("head", "lora")]
+)
+def test_other_arguments_are_refused_by_name_and_nothing_is_written(name, value, args, whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "out")
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    with pytest.raises(ValueError, match=rf"resume_from_checkpoint: {name}: .*changed since the checkpoint"):
+        train_again(args, **{name: value})
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()} == before
+
+
+def test_a_changed_dataset_is_refused(args, whole, tree, tmp_path):
+    shutil.copytree(whole, tmp_path / "out")
+    shutil.copytree(tree, tmp_path / "raw")
+    mask = tmp_path / "raw/train/scene_0/masks/0.png"
+    shutil.copy(tmp_path / "raw/train/scene_1/masks/0.png", mask)
+    with pytest.raises(ValueError, match="resume_from_checkpoint: dataset_name: its images, masks or groups"):
+        train_again(args, dataset_name=str(tmp_path / "raw"))
+
+
+def test_a_moved_dataset_is_not_a_changed_one(args, whole, tree, tmp_path):
+    shutil.copytree(whole, tmp_path / "out")
+    shutil.copytree(tree, tmp_path / "elsewhere")
+    train_again(args, dataset_name=str(tmp_path / "elsewhere"), proxies_dir=str(tree / "proxies"))
+    assert_same_run(tmp_path / "out", whole)
+
+
+def test_a_run_that_ended_without_checkpoints_is_not_started_again(args, whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "out", ignore=shutil.ignore_patterns("checkpoint-*"))
+    with pytest.raises(ValueError, match="has ended and its checkpoints are gone"):
+        train_again(args)
+
+
+def train_on_two(args):
+    AcceleratorState._reset_state(reset_partial_state=True)  # the parent's, inherited by the fork
+    train(args)
+
+
+def test_two_processes_give_the_adapter_of_one(base_dir, tree, whole, tmp_path):
+    args = arguments(base_dir, tree, tmp_path / "out", learning_rate=2e-5, proxies_dir=str(tmp_path / "proxies"))
+    debug_launcher(train_on_two, (args,), num_processes=2)
+    args = arguments(base_dir, tree, tmp_path / "one", learning_rate=2e-5)
+    train(args)
+    two, one = weights(tmp_path / "out/adapter-last"), weights(tmp_path / "one/adapter-last")
+    assert two.keys() == one.keys()
+    for key in one:
+        torch.testing.assert_close(two[key], one[key], rtol=0, atol=1e-5)
+    rows = [json.loads(line) for line in (tmp_path / "out/metrics.jsonl").read_text().splitlines()]
+    expected = [json.loads(line) for line in (tmp_path / "one/metrics.jsonl").read_text().splitlines()]
+    assert rows[0] == expected[0]
+    assert rows[-1]["val_gce"] == pytest.approx(expected[-1]["val_gce"], rel=1e-3)
+    assert json.loads((tmp_path / "out/adapter/gift.json").read_text())["num_processes"] == 2
+
+
+def test_new_folder_is_whole_or_absent(tmp_path):
+    target = tmp_path / "target"
+    with checkpoints.new_folder(target) as folder:
+        (folder / "a").write_text("old")
+    with pytest.raises(OSError, match="full"), checkpoints.new_folder(target) as folder:
+        (folder / "a").write_text("new")
+        raise OSError("disk full")
+    assert [path.name for path in tmp_path.iterdir()] == ["target"]
+    assert (target / "a").read_text() == "old"
+
+
+def test_leftovers_give_a_replaced_folder_its_name_back(tmp_path):
+    for name in (".checkpoint-2.old", ".checkpoint-3.old", "checkpoint-3", ".checkpoint-4.tmp"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "from").write_text(name)
+    checkpoints.remove_leftovers(tmp_path)
+    assert {path.name: (path / "from").read_text() for path in tmp_path.iterdir()} == {
+        "checkpoint-2": ".checkpoint-2.old",
+        "checkpoint-3": "checkpoint-3",
+    }

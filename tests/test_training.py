@@ -1,0 +1,273 @@
+"""A run from raw tree to adapter: what it computes, what it leaves on disk, and what it refuses."""
+
+import json
+import shutil
+
+import pytest
+import torch
+from peft import PeftModel
+from runs import arguments, train_again, weights
+from safetensors.torch import load_file
+from tiny import write_group, write_raw_tree
+from transformers import AutoModelForDepthEstimation
+
+from gift_peft.data.gift_i import load_gift_i
+from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.losses import geometry_consistency_error
+from gift_peft.training import loop, start, train
+from gift_peft.training.groups import PreparedGroups, epoch_order
+
+# transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
+pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
+
+KEYS = ["step", "epoch", "loss", "consistency", "distillation", "train_gce", "val_gce"] + [
+    f"val_{region}_{metric}" for region in ("tom", "other", "all") for metric in ("mae", "abs_rel", "rmse", "delta1")
+]
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return write_raw_tree(tmp_path_factory.mktemp("tree") / "raw", train=(2, 3, 2))
+
+
+@pytest.fixture(scope="module")
+def run(base_dir, tree, tmp_path_factory):
+    """(result, the model it trained, bytes of the base before) of a run of three epochs."""
+    out = tmp_path_factory.mktemp("run") / "out"
+    before = (base_dir / "model.safetensors").read_bytes()
+    captured = []
+
+    class Capture(loop.Run):
+        def __init__(self, *args):
+            super().__init__(*args)
+            captured.append(self.model)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "Run", Capture)
+        result = train(arguments(base_dir, tree, out, num_train_epochs=3, checkpointing_steps=None, seed=3))
+    return result, captured[0], before
+
+
+@pytest.fixture(scope="module")
+def groups(base_dir, tree):
+    """{split: groups with proxies} after the run has made them."""
+
+    def prepared(split):
+        rows = load_gift_i(tree, split, teacher=base_dir, size=(56, 70))
+        return PreparedGroups(rows, loop.AutoImageProcessor.from_pretrained(base_dir), (56, 70), num_threads=0)
+
+    return prepared
+
+
+def rows_of(out):
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_metrics_have_the_documented_keys_and_rows(run):
+    result, _, _ = run
+    rows = rows_of(result.output_dir)
+    assert rows == result.metrics
+    assert [(row["step"], row["epoch"]) for row in rows] == [(0, 0), (3, 1), (6, 2), (9, 3)]
+    assert all(list(row) == KEYS for row in rows)
+
+
+def test_training_lowers_loss_and_gce(run):
+    rows = run[0].metrics
+    assert rows[-1]["loss"] < rows[1]["loss"]
+    assert rows[-1]["val_gce"] < rows[0]["val_gce"]
+
+
+def test_row_zero_is_the_base(run, groups, base_dir):
+    row = run[0].metrics[0]
+    train_groups = groups("train")
+    gce = geometry_consistency_error((group.target, group.mask) for group in map(train_groups.__getitem__, range(3)))
+    assert row["train_gce"] == row["loss"] == row["consistency"] == pytest.approx(gce, rel=1e-6)
+    assert row["distillation"] == 0
+    base = AutoModelForDepthEstimation.from_pretrained(base_dir)
+    report = evaluate_gift_i(groups("validation"), base, kind="inverse_depth", progress=False)
+    assert row["val_gce"] == report.gce["base"]
+    assert row["val_tom_rmse"] == report.summary["tom"]["rmse"]
+
+
+def test_teacher_is_untouched_and_the_saved_adapter_is_the_trained_one(run, base_dir, groups):
+    result, model, before = run
+    assert (base_dir / "model.safetensors").read_bytes() == before
+    pixel_values = groups("train")[0].pixel_values
+    base = AutoModelForDepthEstimation.from_pretrained(base_dir).eval()
+    with torch.no_grad():
+        expected = base(pixel_values=pixel_values).predicted_depth
+        trained = model(pixel_values=pixel_values).predicted_depth
+        with model.disable_adapter():
+            assert torch.equal(model(pixel_values=pixel_values).predicted_depth, expected)
+        loaded = PeftModel.from_pretrained(base, result.output_dir / "adapter-last").eval()
+        assert torch.equal(loaded(pixel_values=pixel_values).predicted_depth, trained)
+    assert not torch.equal(trained, expected)
+
+
+def test_adapter_has_the_smallest_validation_gce(run, base_dir, groups):
+    result = run[0]
+    best = min(result.metrics[1:], key=lambda row: row["val_gce"])
+    assert result.best_step == best["step"]
+    gift = json.loads((result.output_dir / "adapter/gift.json").read_text())
+    assert (gift["step"], gift["metrics"]["adapter"], gift["metrics"]["base"]) == (
+        best["step"],
+        best,
+        result.metrics[0],
+    )
+    model = PeftModel.from_pretrained(
+        AutoModelForDepthEstimation.from_pretrained(base_dir), result.output_dir / "adapter"
+    )
+    report = evaluate_gift_i(groups("validation"), model, kind="inverse_depth", progress=False)
+    assert report.gce["adapted"] == best["val_gce"]
+
+
+def test_first_distillation_is_exactly_zero(base_dir, tree, tmp_path):
+    result = train(arguments(base_dir, tree, tmp_path / "out", max_steps=1))
+    assert result.metrics[1]["distillation"] == 0
+    assert result.metrics[1]["loss"] == result.metrics[1]["consistency"] > 0
+    assert result.metrics[1]["epoch"] == pytest.approx(1 / 3)
+
+
+def test_checkpoints_are_pruned_but_not_the_named_ones(base_dir, tree, tmp_path):
+    out = tmp_path / "out"
+    train(arguments(base_dir, tree, out, checkpoint_at_steps=[1, 3], checkpoints_total_limit=2))
+    assert sorted(folder.name for folder in out.glob("checkpoint-*")) == [f"checkpoint-{n}" for n in (1, 3, 5, 6)]
+    PeftModel.from_pretrained(AutoModelForDepthEstimation.from_pretrained(base_dir), out / "checkpoint-1")
+
+
+def test_without_validation_adapter_is_the_last(base_dir, tree, tmp_path, capsys):
+    shutil.copytree(tree / "train", tmp_path / "raw/train")
+    result = train(arguments(base_dir, tmp_path / "raw", tmp_path / "out"))
+    assert "No validation split" in capsys.readouterr().out
+    assert result.best_step is None
+    assert result.metrics[-1]["val_gce"] is None
+    best, last = weights(tmp_path / "out/adapter"), weights(tmp_path / "out/adapter-last")
+    assert all(torch.equal(best[key], last[key]) for key in last)
+
+
+def test_other_heads_and_a_spelled_out_recipe(base_dir, tree, tmp_path):
+    train(arguments(base_dir, tree, tmp_path / "lora", max_steps=1, head="lora"))
+    assert not any(key.endswith("head.conv1.weight") for key in weights(tmp_path / "lora/adapter"))
+    recipe = {"target_modules": r".*\.q_proj", "modules_to_save": ["head"], "prediction_kind": "depth"}
+    train(arguments(base_dir, tree, tmp_path / "own", max_steps=1, **recipe))
+    keys = weights(tmp_path / "own/adapter").keys()
+    assert any("q_proj" in key for key in keys)
+    assert not any("v_proj" in key or "neck" in key for key in keys)
+    assert json.loads((tmp_path / "own/adapter/gift.json").read_text())["kind"] == "depth"
+
+
+def test_bf16_is_recorded_and_trains(base_dir, tree, tmp_path):
+    result = train(arguments(base_dir, tree, tmp_path / "out", max_steps=2, mixed_precision="bf16"))
+    assert json.loads((tmp_path / "out/adapter/gift.json").read_text())["mixed_precision"] == "bf16"
+    assert all(value.dtype == torch.float32 for value in weights(tmp_path / "out/adapter").values())
+    assert result.metrics[0]["distillation"] == 0
+
+
+def test_accelerates_fp16_is_refused(base_dir, tree, tmp_path, monkeypatch):
+    monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", "fp16")
+    with pytest.raises(ValueError, match="mixed_precision: fp16"):
+        train(arguments(base_dir, tree, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_a_run_is_refused_and_left_alone(base_dir, tree, tmp_path):
+    out = tmp_path / "out"
+    args = arguments(base_dir, tree, out, max_steps=1)
+    train(args)
+    (out / "notes.txt").write_text("mine")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(ValueError, match=r"output_dir: .*already holds a run"):
+        train(args)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    args.overwrite_output_dir = True
+    args.max_steps = 2
+    train(args)
+    assert len(rows_of(out)) == 2
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_nan_stops_with_the_groups_name_and_leaves_the_last_checkpoint(base_dir, tree, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    args = arguments(base_dir, tree, out)
+
+    def explode(step, *values):
+        output = accumulate(step, *values)
+        if (out / "checkpoint-1").exists():
+            next(p for p in step.model.parameters() if p.requires_grad).data.fill_(float("nan"))
+            return accumulate(step, *values)
+        return output
+
+    accumulate = loop.GroupStep.accumulate
+    with monkeypatch.context() as patch:
+        patch.setattr(loop.GroupStep, "accumulate", explode)
+        with pytest.raises(ValueError, match=r"step 2, group scene_\d: .*(NaN|non-finite).*checkpoint-1") as error:
+            train(args)
+    assert "\n" not in str(error.value)
+    assert [folder.name for folder in out.glob("checkpoint-*")] == ["checkpoint-1"]
+    assert not list(out.glob(".*"))
+    assert train_again(args).step == 6
+
+
+def test_a_diverging_run_names_the_group(base_dir, tree, tmp_path):
+    with pytest.raises(ValueError, match=r"group scene_\d"):
+        train(arguments(base_dir, tree, tmp_path / "out", learning_rate=1e30))
+
+
+def test_missing_proxies_and_a_folder_that_cannot_be_written(base_dir, tree, tmp_path, monkeypatch):
+    def refuse(*args, **kwargs):
+        raise PermissionError(13, "Permission denied", "/read/only/proxies")
+
+    monkeypatch.setattr(loop, "make_proxies", refuse)
+    with pytest.raises(PermissionError, match=r"/read/only/proxies.*gift-peft proxies --base"):
+        train(arguments(base_dir, tree, tmp_path / "out"))
+
+
+def test_a_dataset_without_train_groups(base_dir, tmp_path):
+    write_group(tmp_path / "raw/validation/scene", 2, 0, reference=True)
+    with pytest.raises(ValueError, match=r"dataset_name: .*no train split"):
+        train(arguments(base_dir, tmp_path / "raw", tmp_path / "out"))
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_tracker_that_is_not_installed(base_dir, tree, tmp_path, monkeypatch):
+    monkeypatch.setattr(start, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="report_to: trackio is not installed"):
+        train(arguments(base_dir, tree, tmp_path / "out", report_to="trackio"))
+
+
+def test_tensorboard_logs(base_dir, tree, tmp_path):
+    pytest.importorskip("tensorboard")
+    train(arguments(base_dir, tree, tmp_path / "out", max_steps=1, report_to="tensorboard"))
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = [path.parent for path in (tmp_path / "out/logs").rglob("events*")]
+    tags = set()
+    for folder in events:
+        tags |= set(EventAccumulator(str(folder)).Reload().Tags()["scalars"])
+    assert {"loss", "consistency", "distillation", "train_gce", "val_gce", "val_tom_rmse"} <= tags
+
+
+def test_the_order_is_a_permutation_of_seed_and_epoch():
+    assert sorted(epoch_order(7, 0, 0)) == list(range(7))
+    assert epoch_order(7, 1, 2) == epoch_order(7, 1, 2)
+    assert len({tuple(epoch_order(7, seed, epoch)) for seed in range(3) for epoch in range(3)}) == 9
+
+
+@pytest.mark.parametrize(("threads", "memory"), [(0, 0), (2, 0), (2, 2**30)])
+def test_prepared_groups_come_in_order_whatever_threads_and_cache(base_dir, tree, groups, run, threads, memory):
+    plain = groups("train")
+    prepared = PreparedGroups(plain.dataset, plain.processor, plain.size, threads, memory)
+    for order in ([2, 0, 1], [1, 2, 0]):
+        taken = list(prepared.take(order))
+        assert [group.group_id for group in taken] == [plain[index].group_id for index in order]
+        assert all(torch.equal(group.target, plain[i].target) for group, i in zip(taken, order, strict=True))
+    assert (prepared[0] is prepared[0]) == bool(memory)
+
+
+def test_optimizer_state_covers_the_trained_weights(run):
+    state = load_file(run[0].output_dir / "checkpoint-9/optimizer.safetensors")
+    trained = {name for name, p in run[1].named_parameters() if p.requires_grad}
+    named = {key.rsplit(".", 1)[0] for key in state}
+    # The first fusion layer of a DPT neck has no residual input, so four of its weights never get a gradient.
+    assert {name for name in trained - named if "fusion_stage.layers.0.residual_layer1" not in name} == set()
+    assert named <= trained

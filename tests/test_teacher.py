@@ -21,7 +21,8 @@ from gift_peft.data import load_gift_i, write_gift_i
 from gift_peft.data.preprocess import collate_group, to_pixel_values
 from gift_peft.data.proxies import default_proxies_dir, read_header, write_proxies
 from gift_peft.training import teacher
-from gift_peft.training.teacher import make_proxies, predict_group, teacher_id, teacher_revision
+from gift_peft.evaluation.predict import predict_depth
+from gift_peft.training.teacher import make_proxies, teacher_id, teacher_revision
 
 GROUPS = ["train/scene_0", "train/scene_1", "validation/scene_100"]
 
@@ -47,20 +48,20 @@ def one_line(excinfo, *words):
         assert str(word) in message, message
 
 
-def test_predict_group_is_float32_in_batches_of_two(model):
+def test_prediction_is_float32_in_batches_of_two(model):
     pixels = torch.randn(5, 3, *SIZE)
     calls = []
     model.register_forward_pre_hook(
         lambda _, args, kwargs: calls.append(len(kwargs["pixel_values"])), with_kwargs=True
     )
     with torch.autocast("cpu", torch.bfloat16):
-        proxies = predict_group(model, pixels)
+        proxies = predict_depth(model, pixels)
     assert calls == [2, 2, 1]
     assert proxies.dtype == torch.float32 and proxies.shape == (5, *SIZE) and not proxies.requires_grad
     with torch.no_grad():
         expected = torch.cat([model(pixel_values=pixels[i : i + 2]).predicted_depth for i in (0, 2, 4)])
     assert torch.equal(proxies, expected)
-    assert torch.equal(predict_group(lambda_model(model), pixels), expected)  # a model that returns the tensor itself
+    assert torch.equal(predict_depth(lambda_model(model), pixels), expected)  # a model that returns the tensor itself
 
 
 def lambda_model(model):
@@ -82,12 +83,12 @@ def test_proxies_are_the_models_predictions(raw_tree, base_dir, model):
     for split in ("train", "validation"):
         for row in load_gift_i(raw_tree, split, teacher=base_dir, size=SIZE):
             pixels = to_pixel_values(row["images"], tiny_processor(), SIZE)
-            assert torch.equal(row["proxies"], predict_group(model, pixels))
+            assert torch.equal(row["proxies"], predict_depth(model, pixels))
             if split == "train":
                 assert row["reference_proxy"] is None
             else:
                 pixels = to_pixel_values([row["reference"]], tiny_processor(), SIZE)
-                assert torch.equal(row["reference_proxy"], predict_group(model, pixels)[0])
+                assert torch.equal(row["reference_proxy"], predict_depth(model, pixels)[0])
             group = collate_group(row, tiny_processor(), SIZE)
             assert group.target.shape == group.mask.shape and group.target.dtype == torch.float32
     header = read_header(folder / "validation/scene_100.safetensors")

@@ -135,7 +135,7 @@ def run_evaluation(
 ) -> GiftIReport:
     """`gift-peft evaluate`: loads, evaluates, prints the table, writes `metrics.json`, `rows.jsonl`, `report.md`."""
     loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
-    groups = load_gift_i(dataset, split, revision=dataset_revision)
+    groups = load_gift_i(dataset, split, dataset_revision=dataset_revision)
     report = evaluate_gift_i(
         groups,
         loaded.model,

@@ -25,11 +25,12 @@ from gift_peft.data.proxies import (
     teacher_revision,
     write_proxies,
 )
+from gift_peft.evaluation.predict import predict_depth
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-__all__ = ["load_teacher", "make_proxies", "predict_group", "teacher_id", "teacher_revision"]
+__all__ = ["load_teacher", "make_proxies", "teacher_id", "teacher_revision"]
 
 
 def load_teacher(base: str | Path, revision: str | None = None) -> tuple[torch.nn.Module, object]:
@@ -41,22 +42,6 @@ def load_teacher(base: str | Path, revision: str | None = None) -> tuple[torch.n
         return model.eval(), AutoImageProcessor.from_pretrained(base, revision=revision)
     except (OSError, ValueError) as error:
         raise ValueError(f"base model {base}: {str(error).strip().splitlines()[0]}") from error
-
-
-@torch.no_grad()
-def predict_group(model: torch.nn.Module, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
-    """(N, 3, h, w) to (N, H, W) float32 on the CPU: forwards of `batch_size` in image order, never in half precision.
-
-    The model's mode is left as it is. `model(pixel_values=x)` returns a tensor or has `.predicted_depth`.
-    """
-    device = next(model.parameters()).device
-    predictions = []
-    with torch.autocast(device.type, enabled=False):
-        for batch in pixel_values.split(batch_size):
-            output = model(pixel_values=batch.to(device))
-            output = getattr(output, "predicted_depth", output)
-            predictions.append(output.float().cpu())
-    return torch.cat(predictions)
 
 
 def make_proxies(
@@ -136,10 +121,10 @@ def _is_current(path: Path, expected: dict, names: Sequence[str], command: str) 
 def _predict_row(model, processor, row: dict, size: tuple[int, int], batch_size: int):
     """(proxies (N, h, w), reference (h, w) or None) of one row; ValueError naming the image of a bad prediction."""
     names, images = list(row["image_names"]), row["images"]
-    proxies = predict_group(model, to_pixel_values(images, processor, size), batch_size)
+    proxies = predict_depth(model, to_pixel_values(images, processor, size), batch_size)
     reference = None
     if row["reference"] is not None:
-        reference = predict_group(model, to_pixel_values([row["reference"]], processor, size))[0]
+        reference = predict_depth(model, to_pixel_values([row["reference"]], processor, size))[0]
     for name, proxy in [*zip(names, proxies, strict=True), ("the reference", reference)]:
         if proxy is not None and tuple(proxy.shape) != tuple(size):
             raise ValueError(

@@ -20,8 +20,8 @@ from torch.utils.data import DataLoader
 from gift_peft.data import load_gift_i, write_gift_i
 from gift_peft.data.preprocess import collate_group, to_pixel_values
 from gift_peft.data.proxies import default_proxies_dir, read_header, write_proxies
-from gift_peft.training import teacher
 from gift_peft.evaluation.predict import predict_depth
+from gift_peft.training import teacher
 from gift_peft.training.teacher import make_proxies, teacher_id, teacher_revision
 
 GROUPS = ["train/scene_0", "train/scene_1", "validation/scene_100"]

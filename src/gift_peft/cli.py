@@ -123,9 +123,12 @@ def _proxies(args: argparse.Namespace, rest: list[str]) -> int:
 
 
 def _train(args: argparse.Namespace, rest: list[str]) -> int:
-    from gift_peft.training import parse_arguments, train
+    from gift_peft.training import parse_arguments
 
-    result = train(parse_arguments(rest))
+    arguments = parse_arguments(rest)
+    from gift_peft.training import train  # after the arguments are known to be right: this takes seconds
+
+    result = train(arguments)
     return 128 + result.signal if result.signal else 0
 
 

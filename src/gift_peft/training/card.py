@@ -197,11 +197,22 @@ def check_push(args: GiftTrainingArguments) -> None:
 
 
 def push(folder: Path, args: GiftTrainingArguments) -> str:
-    """Upload an adapter folder (the five files of `UPLOADED`); returns the repository's id."""
+    """Upload an adapter folder (the five files of `UPLOADED`); returns the repository's id.
+
+    OSError if that fails; the run itself is complete then, and resuming it uploads again.
+    """
     from huggingface_hub import HfApi
 
     api = HfApi()
     name = args.hub_model_id or Path(args.output_dir).resolve().name
-    repository = api.create_repo(repo_id=name, private=args.hub_private_repo, exist_ok=True).repo_id
-    api.upload_folder(repo_id=repository, folder_path=folder, allow_patterns=UPLOADED, commit_message="GIFT adapter")
+    try:
+        repository = api.create_repo(repo_id=name, private=args.hub_private_repo, exist_ok=True).repo_id
+        api.upload_folder(
+            repo_id=repository, folder_path=folder, allow_patterns=UPLOADED, commit_message="GIFT adapter"
+        )
+    except (OSError, ValueError) as error:  # HfHubHTTPError is an OSError, a malformed repository name a ValueError
+        raise OSError(
+            f"push_to_hub: {error} (the adapter is in {folder}; the same command with "
+            "--resume_from_checkpoint latest uploads it again)"
+        ) from error
     return repository

@@ -1,0 +1,163 @@
+"""The card a run writes is a valid one, tells what was measured, and holds no path; the upload gets five files."""
+
+import json
+from types import SimpleNamespace
+
+import huggingface_hub
+import pytest
+from huggingface_hub import ModelCard
+from runs import arguments, train_again
+from tiny import write_raw_tree
+
+from gift_peft.training import GiftTrainingArguments, card, loop, start, train
+
+ROW = {"step": 0, "epoch": 0, "val_gce": 0.5} | {
+    f"val_{region}_{metric}": 0.25 for region in ("tom", "other", "all") for metric in card.METRICS
+}
+RECORD = {
+    "model_type": "depth_anything",
+    "kind": "inverse_depth",
+    "size": [476, 644],
+    "num_groups": 12,
+    "step": 600,
+    "epoch": 50.0,
+    "mixed_precision": "bf16",
+    "num_processes": 1,
+}
+
+
+def make(tmp_path, adapted, **changes):
+    args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out", **changes)
+    record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
+    (tmp_path / "README.md").write_text(card.model_card(args, record))
+    return ModelCard.load(tmp_path / "README.md")
+
+
+def test_metadata_on_the_hub(tmp_path):
+    adapted = ROW | {"val_gce": 0.125, "val_tom_rmse": 0.2, "step": 600}
+    loaded = make(tmp_path, adapted, hub_model_id="someone/gift-large")
+    data = loaded.data
+    assert data.library_name == "peft"
+    assert data.base_model == "depth-anything/Depth-Anything-V2-Large-hf"
+    assert data.to_dict()["base_model_relation"] == "adapter"
+    assert (data.pipeline_tag, data.license, data.datasets) == ("depth-estimation", "cc-by-nc-4.0", ["someone/gift-i"])
+    results = {result.metric_type: result.metric_value for result in data.eval_results}
+    assert (results["gce"], results["tom_rmse"], results["other_rmse"]) == (0.125, 0.2, 0.25)
+    assert data.model_name == "gift-large"
+    assert 'model="someone/gift-large"' in loaded.text
+    assert "| GCE ↓ | 0.50000 | 0.12500 | -75.0 % |" in loaded.text
+    assert "larger is nearer" in loaded.text
+
+
+def test_a_licence_may_be_stated(tmp_path):
+    assert make(tmp_path, ROW, license="mit").data.license == "mit"
+    assert card.base_license("someone/unknown") == "other"
+    (tmp_path / "README.md").write_text("---\nlicense: bsd-2-clause\n---\n")
+    assert card.base_license(str(tmp_path)) == "bsd-2-clause"
+
+
+def test_without_validation_nothing_is_claimed(tmp_path):
+    loaded = make(tmp_path, {key: None if key.startswith("val") else value for key, value in ROW.items()})
+    assert loaded.data.eval_results is None
+    assert "nothing was measured" in loaded.text
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return write_raw_tree(tmp_path_factory.mktemp("tree") / "raw")
+
+
+def test_a_runs_card_parses_and_names_no_path(base_dir, tree, tmp_path):
+    result = train(arguments(base_dir, tree, tmp_path / "out", max_steps=2))
+    for name in ("adapter", "adapter-last"):
+        folder = tmp_path / "out" / name
+        loaded = ModelCard.load(folder / "README.md")
+        measured = {r.metric_type: r.metric_value for r in loaded.data.eval_results}
+        assert measured["gce"] == pytest.approx(result.metrics[1]["val_gce"], abs=1e-6)
+        assert loaded.data.base_model is None
+        for file in ("README.md", "gift.json"):
+            text = (folder / file).read_text()
+            assert str(base_dir) not in text and str(tmp_path) not in text and str(tree) not in text
+        gift = json.loads((folder / "gift.json").read_text())
+        assert gift["arguments"]["learning_rate"] == 2e-4
+        assert gift["arguments"]["dataset_name"] == "raw"
+        assert {"torch", "peft", "transformers", "gift-peft"} <= gift["versions"].keys()
+        for version in ("torch", "peft", "transformers"):
+            assert f"{version} {gift['versions'][version]}" in loaded.text
+
+
+class HubStandIn:
+    """What `push` uses of HfApi; remembers the calls."""
+
+    calls: list
+
+    def create_repo(self, repo_id, **options):
+        self.calls.append(("create_repo", repo_id, options))
+        return SimpleNamespace(repo_id=f"me/{repo_id}" if "/" not in repo_id else repo_id)
+
+    def upload_folder(self, *, repo_id, folder_path, allow_patterns, **options):
+        names = {path.name for path in folder_path.iterdir()}
+        self.calls.append(("upload_folder", repo_id, sorted(names & set(allow_patterns))))
+
+
+@pytest.fixture
+def hub(monkeypatch):
+    """Calls to a hub that takes a run whose base is a folder, which `check_push` would refuse."""
+    calls = []
+    monkeypatch.setattr(HubStandIn, "calls", calls, raising=False)
+    monkeypatch.setattr(huggingface_hub, "HfApi", HubStandIn)
+    monkeypatch.setattr(start, "check_push", lambda args: None)
+    return calls
+
+
+@pytest.mark.parametrize(("name", "repository"), [(None, "me/out"), ("lab/gift", "lab/gift")])
+def test_push_uploads_the_adapter_and_nothing_else(name, repository, hub, base_dir, tree, tmp_path, capsys):
+    args = arguments(base_dir, tree, tmp_path / "out", max_steps=1, push_to_hub=True, hub_model_id=name)
+    args.hub_private_repo = True
+    train(args)
+    files = ["README.md", "adapter_config.json", "adapter_model.safetensors", "gift.json", "preprocessor_config.json"]
+    assert hub == [
+        ("create_repo", name or "out", {"private": True, "exist_ok": True}),
+        ("upload_folder", repository, files),
+    ]
+    assert f"https://huggingface.co/{repository}" in capsys.readouterr().out
+
+
+def test_a_failed_upload_leaves_the_adapter_and_can_be_repeated(hub, base_dir, tree, tmp_path, monkeypatch):
+    def refuse(self, *args, **kwargs):
+        raise OSError("the hub is away")
+
+    args = arguments(base_dir, tree, tmp_path / "out", max_steps=1, push_to_hub=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(HubStandIn, "upload_folder", refuse)
+        with pytest.raises(OSError, match=r"push_to_hub: .*the hub is away.*resume_from_checkpoint latest"):
+            train(args)
+    assert (tmp_path / "out/adapter-last/adapter_model.safetensors").exists()
+    train_again(args)
+    assert hub[-1][0] == "upload_folder"
+
+
+def test_push_is_checked_before_anything_is_loaded(base_dir, tree, tmp_path, monkeypatch):
+    def never(*args):
+        raise AssertionError("training had begun")
+
+    monkeypatch.setattr(loop, "Run", never)
+    monkeypatch.setattr(huggingface_hub, "get_token", lambda: None)
+    with pytest.raises(ValueError, match="push_to_hub: no token; run `hf auth login` or set HF_TOKEN"):
+        train(GiftTrainingArguments("some/base", str(tree), str(tmp_path / "out"), push_to_hub=True))
+    with pytest.raises(ValueError, match="push_to_hub: model_name_or_path is a local folder"):
+        train(arguments(base_dir, tree, tmp_path / "out", push_to_hub=True))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "local"),
+    [("owner/model", False), ("model", False), ("./base", True), ("/a/b", True), ("a/b/c", True), ("~/base", True)],
+)
+def test_hub_ids_and_paths(name, local, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert card.is_local(name) is local
+    (tmp_path / "model").mkdir()
+    assert card.is_local("model")
+    assert card.portable_name("owner/model") == "owner/model"
+    assert card.portable_name(str(tmp_path / "model")) == "model"

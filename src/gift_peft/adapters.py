@@ -108,9 +108,11 @@ def get_gift_model(model: nn.Module, rank: int = 8, head: str = "full", recipe: 
     _check_base(model)
     saved = {name: _modules_named(model, name) for name in recipe.modules_to_save} if head != "none" else {}
     targets = recipe.target_modules
+    if not any(re.fullmatch(_pattern(targets), name) for name, _ in model.named_modules()):
+        raise ValueError(f"target_modules: {targets!r} names no module of this {type(model).__name__}")
     if head == "lora":
         roots = [root for found in saved.values() for root in found]
-        targets = _union(targets, _lora_layers(model, roots))
+        targets = "|".join([f"({_pattern(targets)})", *map(re.escape, _lora_layers(model, roots))])
     config = LoraConfig(
         r=rank,
         target_modules=targets,
@@ -246,11 +248,9 @@ def _lora_layers(model: nn.Module, roots: list[str]) -> list[str]:
     ]
 
 
-def _union(targets: str | list[str], names: list[str]) -> str:
-    """One regular expression for the encoder's targets and exactly these names."""
-    if not isinstance(targets, str):
-        targets = rf"(.*\.)?({'|'.join(map(re.escape, targets))})"
-    return "|".join([f"({targets})", *map(re.escape, names)])
+def _pattern(targets: str | list[str]) -> str:
+    """PEFT's reading of `target_modules` as one regular expression."""
+    return targets if isinstance(targets, str) else rf"(.*\.)?({'|'.join(map(re.escape, targets))})"
 
 
 def save_adapter(

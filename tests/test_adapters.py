@@ -1,0 +1,583 @@
+"""Recipes, scaling and the adapter folder: what is trained, what stays the base to the bit, what others can load."""
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+from huggingface_hub import ModelCard
+from peft import LoraConfig, PeftModel, get_peft_model
+from PIL import Image
+from tiny import tiny_model, tiny_processor
+from torch import nn
+from transformers import (
+    AutoImageProcessor,
+    AutoModelForDepthEstimation,
+    BeitConfig,
+    DepthProConfig,
+    DepthProForDepthEstimation,
+    Dinov2Config,
+    DPTConfig,
+    DPTForDepthEstimation,
+    PromptDepthAnythingConfig,
+    PromptDepthAnythingForDepthEstimation,
+    ZoeDepthConfig,
+    ZoeDepthForDepthEstimation,
+)
+
+from gift_peft.adapters import (
+    HEADS,
+    RECIPES,
+    GiftRecipe,
+    check_lora_config,
+    get_gift_model,
+    get_recipe,
+    save_adapter,
+    set_adapter_scale,
+)
+from gift_peft.group_step import GroupStep
+
+# peft 0.21 reads an attribute that transformers 5.23 deprecates
+pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
+
+LOCAL_BASE = "ignore:the base is the local folder:UserWarning"
+PIXELS = torch.randn(2, 3, 56, 70, generator=torch.Generator().manual_seed(0))
+
+
+def depth(model, pixels=PIXELS):
+    with torch.no_grad():
+        return model(pixel_values=pixels).predicted_depth
+
+
+def trained(model, seed=0):
+    """Move every trainable weight, as a long training would."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            if parameter.requires_grad:
+                parameter += torch.randn(parameter.shape, generator=generator) * 0.02
+    return model
+
+
+def trainable(model):
+    return {name.removeprefix("base_model.model.") for name, p in model.named_parameters() if p.requires_grad}
+
+
+def load_base(folder):
+    return AutoModelForDepthEstimation.from_pretrained(folder)
+
+
+# ---- recipes ----
+
+
+def test_depth_anything_recipe(model):
+    before = depth(model)
+    adapted = get_gift_model(model)
+    assert isinstance(adapted, PeftModel) and not adapted.training
+    assert torch.equal(depth(adapted), before)
+    config = adapted.peft_config["default"]
+    assert config.r == 8 and config.lora_alpha == LoraConfig().lora_alpha and config.lora_dropout == 0
+    assert set(config.modules_to_save) == {"neck", "head"}
+    names = trainable(adapted)
+    lora = {name for name in names if "lora_" in name}
+    assert len(lora) == 4 * 4 * 2  # layers x projections x (A, B)
+    assert all(name.startswith("backbone.encoder.layer.") and ".attention." in name for name in lora)
+    assert all(name.startswith(("neck.", "head.")) for name in names - lora)
+    heads = [*model.neck.original_module.parameters(), *model.head.original_module.parameters()]
+    assert len(names - lora) == len(heads)
+
+
+def test_head_lora(model):
+    adapted = get_gift_model(model, rank=4, head="lora")
+    names = trainable(adapted)
+    assert all("lora_" in name for name in names) and adapted.peft_config["default"].modules_to_save is None
+    layers = {name.split(".lora_")[0] for name in names if name.startswith(("neck.", "head."))}
+    expected = {
+        name.split(".base_layer")[0]
+        for name, module in adapted.base_model.model.named_modules()
+        if name.startswith(("neck.", "head.")) and isinstance(module, nn.Conv2d | nn.Linear) and "lora_" not in name
+    }
+    assert layers == expected and "head.conv1" in layers and "neck.reassemble_stage.layers.0.projection" in layers
+    assert not any("layers.0.resize" in name for name in names)  # a transposed convolution
+    assert all(p.shape[0] == 4 for name, p in adapted.named_parameters() if "lora_A" in name)
+    assert torch.equal(depth(adapted), depth(tiny_model()))
+
+
+def test_head_none(model):
+    names = trainable(get_gift_model(model, head="none"))
+    assert len(names) == 32 and all("lora_" in name for name in names)
+
+
+def test_kind_follows_the_config():
+    recipe = RECIPES["depth_anything"]
+    assert recipe.size == (476, 644)
+    assert recipe.kind_for(tiny_model().config) == "inverse_depth"
+    metric = tiny_model(depth_estimation_type="metric", max_depth=20)
+    assert recipe.kind_for(metric.config) == "depth"
+    assert get_recipe(get_gift_model(metric)) is recipe
+    own = GiftRecipe(["query"], ["head"], kind="depth")
+    assert get_recipe(metric, own) is own and own.kind_for(DPTConfig()) == "depth"
+    with pytest.raises(ValueError, match="dpt: the recipe must say kind"):
+        GiftRecipe(["query"], ["head"]).kind_for(DPTConfig())
+    with pytest.raises(ValueError, match="kind must be one of depth, inverse_depth"):
+        GiftRecipe(["query"], ["head"], kind="disparity")
+
+
+def tiny_dpt():
+    model = DPTForDepthEstimation(
+        DPTConfig(
+            hidden_size=16,
+            num_hidden_layers=4,
+            num_attention_heads=2,
+            intermediate_size=32,
+            image_size=32,
+            patch_size=16,
+            backbone_out_indices=[0, 1, 2, 3],
+            neck_hidden_sizes=[8, 8, 8, 8],
+            fusion_hidden_size=8,
+            hidden_dropout_prob=0.1,
+        )
+    ).eval()
+    nn.init.ones_(model.head.head[4].bias)  # before a ReLU
+    return model
+
+
+def tiny_zoedepth():
+    backbone = BeitConfig(
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        intermediate_size=32,
+        image_size=32,
+        patch_size=16,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=False,
+        use_relative_position_bias=True,
+    )
+    return ZoeDepthForDepthEstimation(
+        ZoeDepthConfig(
+            backbone_config=backbone,
+            backbone_hidden_size=16,
+            neck_hidden_sizes=[8, 8, 8, 8],
+            fusion_hidden_size=8,
+            bottleneck_features=8,
+            num_relative_features=4,
+            bin_embedding_dim=8,
+            num_attractors=[4, 2, 2, 1],
+            bin_configurations=[{"n_bins": 4, "min_depth": 0.001, "max_depth": 10.0, "name": "nyu"}],
+        )
+    ).eval()
+
+
+def tiny_promptda():
+    backbone = Dinov2Config(
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        image_size=28,
+        patch_size=14,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=False,
+    )
+    return PromptDepthAnythingForDepthEstimation(
+        PromptDepthAnythingConfig(
+            backbone_config=backbone,
+            reassemble_hidden_size=16,
+            patch_size=14,
+            neck_hidden_sizes=[8, 8, 8, 8],
+            fusion_hidden_size=8,
+            head_hidden_size=8,
+        )
+    ).eval()
+
+
+def tiny_depth_pro():
+    part = {
+        "model_type": "dinov2",
+        "num_hidden_layers": 2,
+        "hidden_size": 16,
+        "num_attention_heads": 2,
+        "patch_size": 4,
+        "image_size": 32,
+        "mlp_ratio": 2,
+    }
+    return DepthProForDepthEstimation(
+        DepthProConfig(
+            fusion_hidden_size=16,
+            patch_size=32,
+            intermediate_hook_ids=[1, 0],
+            intermediate_feature_dims=[10, 8],
+            scaled_images_ratios=[0.5, 1.0],
+            scaled_images_overlap_ratios=[0.0, 0.2],
+            scaled_images_feature_dims=[12, 8],
+            image_model_config=dict(part),
+            patch_model_config=dict(part),
+            fov_model_config=dict(part),
+            use_fov_model=False,
+        )
+    ).eval()
+
+
+GENERIC = {
+    "dpt": (tiny_dpt, GiftRecipe(["query", "key", "value"], ["neck", "head"], kind="inverse_depth"), 32),
+    "zoedepth": (
+        tiny_zoedepth,
+        GiftRecipe(r"backbone\..*\.attention\..*(q_proj|query|v_proj|value)", ["neck", "metric_head"], kind="depth"),
+        32,
+    ),
+    "prompt_depth_anything": (
+        tiny_promptda,
+        GiftRecipe(r"backbone\..*\.attention\.(q_proj|v_proj)", ["neck", "head"], kind="depth"),
+        28,
+    ),
+    "depth_pro": (
+        tiny_depth_pro,
+        GiftRecipe(["q_proj", "v_proj"], ["depth_pro.neck", "fusion_stage", "head"], kind="inverse_depth"),
+        64,
+    ),
+}
+
+
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize("model_type", GENERIC)
+def test_generic_recipe(model_type, head, tmp_path):
+    """Models without a recipe: wrapped, trained by one group step, saved, loaded, off and on to the bit."""
+    make, recipe, side = GENERIC[model_type]
+    torch.manual_seed(0)
+    base = make()
+    with torch.no_grad():
+        for parameter in base.parameters():
+            parameter += torch.randn_like(parameter) * 0.05
+    base.save_pretrained(tmp_path / "base")
+    pixels = torch.randn(3, 3, side, side)
+    before = depth(base, pixels)
+    with pytest.raises(ValueError, match=f"no recipe for model type '{model_type}'.*GiftRecipe"):
+        get_gift_model(base)
+    model = get_gift_model(base, rank=2, head=head, recipe=recipe)
+    assert torch.equal(depth(model, pixels), before)
+    mask = torch.rand(before.shape) < 0.5
+    output = GroupStep(model).accumulate(pixels, mask, before)
+    assert output.num_pairs == 3
+    assert any(p.grad is not None and p.grad.any() for p in model.parameters())
+    trained(model)
+    save_adapter(model, tmp_path / "adapter", "someone/base")
+    again = PeftModel.from_pretrained(load_base(tmp_path / "base"), tmp_path / "adapter").eval()
+    assert torch.equal(depth(again, pixels), depth(model, pixels))
+    set_adapter_scale(again, 0)
+    assert torch.equal(depth(again, pixels), before)
+
+
+def test_own_dropout_is_switched_off():
+    model = get_gift_model(tiny_dpt().train(), recipe=GENERIC["dpt"][1])
+    assert model.training
+    GroupStep(model)  # refuses dropout
+
+
+# ---- what is refused ----
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_base_is_refused(model, dtype):
+    with pytest.raises(ValueError, match=r"the base is in b?float16 .* load it with dtype=torch.float32"):
+        get_gift_model(model.to(dtype))
+
+
+@pytest.mark.parametrize(
+    ("lora", "message"),
+    [
+        ({"init_lora_weights": "pissa"}, "init_lora_weights='pissa' changes the base"),
+        ({"init_lora_weights": "pissa_niter_4"}, "pissa_niter_4"),
+        ({"init_lora_weights": "olora"}, "olora"),
+        ({"init_lora_weights": False}, "init_lora_weights=False"),
+        ({"bias": "all"}, "bias='all' trains the base's own biases"),
+        ({"bias": "lora_only"}, "bias='lora_only'"),
+        ({"lora_dropout": 0.1}, "lora_dropout must be 0, got 0.1"),
+        ({"use_dora": True}, "use_dora"),
+    ],
+)
+def test_options_that_break_the_teacher_are_refused(model, lora, message):
+    before = model.state_dict().keys()
+    recipe = GiftRecipe(RECIPES["depth_anything"].target_modules, ["neck", "head"], lora=lora)
+    with pytest.raises(ValueError, match=message):
+        get_gift_model(model, recipe=recipe)
+    assert model.state_dict().keys() == before  # still a plain model
+    with pytest.raises(ValueError, match=message):
+        check_lora_config(LoraConfig(target_modules=["q_proj"], **lora))
+
+
+def test_lora_options_reach_peft(model):
+    recipe = GiftRecipe(["q_proj"], ["head"], lora={"lora_alpha": 32, "use_rslora": True})
+    adapted = trained(get_gift_model(model, recipe=recipe))
+    assert adapted.peft_config["default"].lora_alpha == 32
+    after = depth(adapted)
+    set_adapter_scale(adapted, 0)
+    set_adapter_scale(adapted, 1)
+    assert torch.equal(depth(adapted), after)
+
+
+def test_bad_arguments(model):
+    with pytest.raises(ValueError, match="head must be one of full, lora, none"):
+        get_gift_model(model, head="all")
+    with pytest.raises(ValueError, match="the model has no module 'decoder'"):
+        get_gift_model(model, recipe=GiftRecipe(["q_proj"], ["decoder"]))
+    for targets in (["query"], r"encoder\.attention\.q_proj"):
+        with pytest.raises(ValueError, match=r"target_modules: .* names no module of this DepthAnythingFor"):
+            get_gift_model(model, recipe=GiftRecipe(targets, ["head"]))
+    with pytest.raises(ValueError, match="'head' also matches relative_head, metric_head"):
+        get_gift_model(tiny_zoedepth(), recipe=GiftRecipe(["query"], ["head"]))
+    with pytest.raises(ValueError, match="already has an adapter"):
+        get_gift_model(get_gift_model(model))
+
+
+# ---- scale ----
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_adapter_scale(head):
+    base = depth(tiny_model())
+    model = trained(get_gift_model(tiny_model(), head=head))
+    state = {name: value.clone() for name, value in model.state_dict().items()}
+    full, seen = depth(model), {}
+    for scale in (0.5, 0, 1, 0.25, 0.5, 0, 0.25, 1, 1, 0.5, 0.25, 0):
+        set_adapter_scale(model, scale)
+        seen.setdefault(scale, depth(model))
+        assert torch.equal(depth(model), seen[scale])  # no drift
+        with model.disable_adapter():
+            assert torch.equal(depth(model), base)
+        assert torch.equal(depth(model), seen[scale])
+    assert torch.equal(seen[0], base) and torch.equal(seen[1], full)
+    assert len({value.sum().item() for value in seen.values()}) == 4
+    set_adapter_scale(model, 1)
+    assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
+    assert model.state_dict().keys() == state.keys()
+
+
+def test_scaled_weights(model):
+    """base + s (trained - base) for saved modules; alpha / r times s for LoRA."""
+    model = trained(get_gift_model(model, rank=4))
+    wrapper = model.base_model.model.head
+    base, full = wrapper.original_module.conv1.weight.clone(), wrapper.modules_to_save["default"].conv1.weight.clone()
+    set_adapter_scale(model, 0.3)
+    torch.testing.assert_close(wrapper.modules_to_save["default"].conv1.weight, base + 0.3 * (full - base))
+    assert torch.equal(wrapper.original_module.conv1.weight, base)
+    layer = model.base_model.model.backbone.encoder.layer[0].attention.q_proj
+    assert layer.scaling["default"] == pytest.approx(0.3 * 8 / 4)
+
+
+def test_scale_then_merge(model):
+    model = trained(get_gift_model(model))
+    set_adapter_scale(model, 0.5)
+    scaled = depth(model)
+    torch.testing.assert_close(depth(model.merge_and_unload()), scaled, rtol=1e-5, atol=1e-5)
+
+
+def test_scale_refusals(model):
+    with pytest.raises(ValueError, match="no active LoRA adapter"):
+        set_adapter_scale(model, 0.5)
+    model = trained(get_gift_model(model))
+    with pytest.raises(ValueError, match="must be finite"):
+        set_adapter_scale(model, float("nan"))
+    set_adapter_scale(model, 0.5)
+    trained(model)  # at scale 0.5: what should scale 1 be now?
+    before = depth(model)
+    with pytest.raises(ValueError, match=r"changed at adapter scale 0.5: set it to 1"):
+        set_adapter_scale(model, 1)
+    assert torch.equal(depth(model), before)
+    model = trained(get_gift_model(tiny_model()))
+    model.merge_adapter()
+    with pytest.raises(ValueError, match="merged"):
+        set_adapter_scale(model, 0.5)
+    dora = get_peft_model(tiny_model(), LoraConfig(target_modules=["q_proj"], use_dora=True))
+    with pytest.raises(ValueError, match="use_dora"):
+        set_adapter_scale(dora, 0)
+
+
+# ---- the folder ----
+
+
+@pytest.fixture(scope="module")
+def saved(base_dir, tmp_path_factory):
+    """(adapter folder, the depth it must give, the base's depth) with everything in it."""
+    folder = tmp_path_factory.mktemp("saved") / "adapter"
+    base = load_base(base_dir)
+    before = depth(base)
+    model = trained(get_gift_model(base))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the base is the local folder")
+        save_adapter(
+            model,
+            folder,
+            processor=tiny_processor(),
+            size=(42, 70),
+            gift={"recipe": "depth_anything", "metrics": {"gce": 0.25, "empty": float("nan")}},
+            card="---\nlibrary_name: peft\ntags:\n- mirrors\n---\n\nThe card.\n",
+        )
+    return folder, depth(model), before
+
+
+def test_folder(saved, base_dir):
+    folder, _, _ = saved
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "README.md",
+        "adapter_config.json",
+        "adapter_model.safetensors",
+        "gift.json",
+        "preprocessor_config.json",
+    ]
+    assert [path.name for path in folder.parent.iterdir()] == ["adapter"]  # nothing temporary is left
+    config = json.loads((folder / "adapter_config.json").read_text())
+    assert config["base_model_name_or_path"] == str(base_dir) and config["inference_mode"]
+    gift = json.loads((folder / "gift.json").read_text())
+    assert gift["metrics"] == {"gce": 0.25, "empty": None} and gift["size"] == [42, 70]
+    assert gift["versions"]["torch"] == torch.__version__
+    card = ModelCard.load(folder / "README.md")
+    assert card.text.strip() == "The card." and card.data.tags == ["mirrors"]  # PEFT's own card came before
+    processor = AutoImageProcessor.from_pretrained(folder, backend="pil")
+    for size in ((100, 90), (30, 400), (70, 42)):
+        assert processor(Image.new("RGB", size), return_tensors="pt")["pixel_values"].shape == (1, 3, 42, 70)
+
+
+def test_folder_loads(saved, base_dir):
+    folder, after, before = saved
+    model = PeftModel.from_pretrained(load_base(base_dir), folder).eval()
+    assert torch.equal(depth(model), after)
+    with model.disable_adapter():
+        assert torch.equal(depth(model), before)
+    for scale, expected in ((0, before), (1, after), (0, before), (0.5, None), (1, after)):
+        set_adapter_scale(model, scale)
+        assert expected is None or torch.equal(depth(model), expected)
+    torch.testing.assert_close(depth(model.merge_and_unload()), after, rtol=1e-5, atol=1e-5)
+
+
+def test_folder_loads_in_transformers(saved):
+    folder, after, before = saved
+    model = AutoModelForDepthEstimation.from_pretrained(folder)
+    assert torch.equal(depth(model), after)
+    set_adapter_scale(model, 0)
+    assert torch.equal(depth(model), before)
+    set_adapter_scale(model, 1)
+    assert torch.equal(depth(model), after)
+
+
+WITHOUT_THIS_PACKAGE = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "gift_peft":
+            raise ImportError("gift_peft is blocked")
+
+sys.meta_path.insert(0, Blocker())
+import torch
+from peft import PeftModel
+from transformers import AutoModelForDepthEstimation
+
+torch.set_num_threads(1)
+base_dir, folder, given, out = sys.argv[1:]
+pixels = torch.load(given)
+with torch.no_grad():
+    base = AutoModelForDepthEstimation.from_pretrained(base_dir)
+    model = PeftModel.from_pretrained(base, folder).eval()
+    results = {"peft": model(pixel_values=pixels).predicted_depth}
+    with model.disable_adapter():
+        results["off"] = model(pixel_values=pixels).predicted_depth
+    results["auto"] = AutoModelForDepthEstimation.from_pretrained(folder)(pixel_values=pixels).predicted_depth
+    results["merged"] = model.merge_and_unload()(pixel_values=pixels).predicted_depth
+assert "gift_peft" not in sys.modules
+try:
+    import gift_peft
+except ImportError:
+    torch.save(results, out)
+"""
+
+
+def test_folder_loads_without_this_package(saved, base_dir, tmp_path):
+    folder, after, before = saved
+    torch.save(PIXELS, tmp_path / "pixels.pt")
+    command = [
+        sys.executable,
+        "-c",
+        WITHOUT_THIS_PACKAGE,
+        base_dir,
+        folder,
+        tmp_path / "pixels.pt",
+        tmp_path / "out.pt",
+    ]
+    run = subprocess.run(
+        command, capture_output=True, text=True, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    assert run.returncode == 0, run.stderr
+    results = torch.load(tmp_path / "out.pt")
+    assert torch.equal(results["peft"], after) and torch.equal(results["auto"], after)
+    assert torch.equal(results["off"], before)
+    torch.testing.assert_close(results["merged"], after, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.filterwarnings(LOCAL_BASE)
+def test_base_name_and_card(base_dir, tmp_path):
+    model = get_gift_model(load_base(base_dir), head="none")
+    with pytest.warns(UserWarning, match="the base is the local folder"):
+        save_adapter(model, tmp_path / "local")
+    text = (tmp_path / "local" / "README.md").read_text()
+    assert str(base_dir) not in text and "base_model" not in text
+    with pytest.raises(ValueError, match="the card names the local base path"):
+        save_adapter(model, tmp_path / "leak", card=f"base_model: {base_dir}")
+    assert not (tmp_path / "leak").exists()
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        save_adapter(model, tmp_path / "hub", "depth-anything/Depth-Anything-V2-Large-hf", "main")
+    config = json.loads((tmp_path / "hub" / "adapter_config.json").read_text())
+    assert (config["base_model_name_or_path"], config["revision"]) == (
+        "depth-anything/Depth-Anything-V2-Large-hf",
+        "main",
+    )
+    assert (
+        ModelCard.load(tmp_path / "hub" / "README.md").data.base_model == "depth-anything/Depth-Anything-V2-Large-hf"
+    )
+
+    with pytest.warns(UserWarning, match="names no base model"):
+        save_adapter(get_gift_model(tiny_model()), tmp_path / "nameless")
+
+
+def test_saving_replaces_the_whole_folder(model, tmp_path):
+    folder = tmp_path / "adapter"
+    model = get_gift_model(model)
+    save_adapter(model, folder, "someone/base", processor=tiny_processor(), size=(28, 28))
+    first = depth(trained(model))
+    save_adapter(model, folder, "someone/base")
+    assert not (folder / "preprocessor_config.json").exists()
+    assert torch.equal(depth(PeftModel.from_pretrained(tiny_model(), folder).eval()), first)
+
+    (folder / "photo.jpg").touch()
+    with pytest.raises(ValueError, match=r"holds files that are no adapter's \(photo.jpg\)"):
+        save_adapter(model, folder, "someone/base")
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="file is not a folder"):
+        save_adapter(model, tmp_path / "file", "someone/base")
+
+
+def test_failed_save_keeps_the_old_folder(model, tmp_path):
+    model = get_gift_model(model)
+    save_adapter(model, tmp_path / "adapter", "someone/base")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "adapter").iterdir()}
+    trained(model)
+    with pytest.raises(TypeError):
+        save_adapter(model, tmp_path / "adapter", "someone/base", card=3.5)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "adapter").iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["adapter"]
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_scaled_adapter_is_not_saved(head, tmp_path):
+    model = trained(get_gift_model(tiny_model(), head=head))
+    set_adapter_scale(model, 0.5)
+    with pytest.raises(ValueError, match=r"call set_adapter_scale\(model, 1\) first"):
+        save_adapter(model, tmp_path / "adapter", "someone/base")
+    set_adapter_scale(model, 1)
+    save_adapter(model, tmp_path / "adapter", "someone/base")
+    with pytest.raises(ValueError, match="needs a PeftModel"):
+        save_adapter(tiny_model(), tmp_path / "plain", "someone/base")

@@ -1,0 +1,114 @@
+"""Reading an official VGGT checkpoint: safetensors or a torch file, tensors only, depth path only.
+
+Pickles are opened with `weights_only=True`, so a file that would run code is refused. Tensors of the camera, point and
+track heads are left on disk.
+"""
+
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+
+DEPTH_PATH = ("aggregator.", "depth_head.")
+WRAPPERS = ("model_state_dict", "state_dict", "model")
+OPTIONAL = "aggregator.patch_embed.mask_token"  # only pre-training used it; some files leave it out
+
+
+def read_official(source: str | Path | Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Tensors of aggregator and depth head by official name, from a file or from a dict of tensors.
+
+    `module.` prefixes and a `model_state_dict`, `state_dict` or `model` wrapper are taken off. Raises
+    FileNotFoundError, and ValueError for a file that is truncated, holds more than tensors, or is no VGGT checkpoint.
+    """
+    if isinstance(source, Mapping):
+        return _depth_path(source, "the given dict")
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such checkpoint file")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; name the checkpoint file in it, such as model.safetensors")
+    with path.open("rb") as file:
+        start = file.read(2)
+    # Told apart by content: torch files are zip archives or, from before 2020, bare pickles.
+    if start == b"PK" or start[:1] == b"\x80":
+        return _depth_path(_read_torch(path), str(path))
+    return _read_safetensors(path)
+
+
+def check_official(state: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor], where: str) -> None:
+    """Raise ValueError naming the first tensor that `state` lacks, has too much, or in another shape."""
+    for name, tensor in expected.items():
+        if name not in state:
+            if name == OPTIONAL:
+                continue
+            raise ValueError(f"{where}: the tensor {name} is missing; is this another variant than the config's?")
+        if state[name].shape != tensor.shape:
+            raise ValueError(
+                f"{where}: {name} has shape {tuple(state[name].shape)}, the config asks for {tuple(tensor.shape)}"
+            )
+    for name in state:
+        if name not in expected:
+            raise ValueError(f"{where}: {name} has no place in the config's model; is this another variant?")
+
+
+def _depth_path(content: object, where: str) -> dict[str, torch.Tensor]:
+    while isinstance(content, Mapping) and (
+        inner := [key for key in WRAPPERS if isinstance(content.get(key), Mapping)]
+    ):
+        content = content[inner[0]]
+    if not isinstance(content, Mapping):
+        raise ValueError(f"{where}: holds a {type(content).__name__}, not tensors by name")
+    named = {_official(key): value for key, value in content.items()}
+    state = {key: value for key, value in named.items() if key.startswith(DEPTH_PATH)}
+    _require_some(state, named, where)
+    for key, value in state.items():
+        if not isinstance(value, torch.Tensor):
+            raise ValueError(f"{where}: {key} is a {type(value).__name__}, not a tensor")
+    return state
+
+
+def _official(key: object) -> str:
+    key = str(key)
+    while key.startswith("module."):  # nn.DataParallel, DistributedDataParallel
+        key = key.removeprefix("module.")
+    return key
+
+
+def _require_some(state: Mapping, named: Mapping, where: str) -> None:
+    if not state:
+        first = f"its first entry is {next(iter(named))!r}" if named else "it is empty"
+        raise ValueError(f"{where}: not a VGGT checkpoint, no tensor starts with {' or '.join(DEPTH_PATH)}; {first}")
+
+
+def _read_safetensors(path: Path) -> dict[str, torch.Tensor]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            names = {_official(key): key for key in file.keys()}  # noqa: SIM118 (not a dict)
+            wanted = {name: key for name, key in names.items() if name.startswith(DEPTH_PATH)}
+            _require_some(wanted, names, str(path))
+            return {name: file.get_tensor(key) for name, key in wanted.items()}
+    except (SafetensorError, OSError) as error:
+        raise ValueError(
+            f"{path}: truncated, or neither a safetensors nor a torch file ({path.stat().st_size} bytes: "
+            f"{_first_line(error)})"
+        ) from None
+
+
+def _read_torch(path: Path) -> object:
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+    except pickle.UnpicklingError as error:
+        raise ValueError(
+            f"{path}: refused, it holds more than tensors and would run code, or is damaged ({_first_line(error)})"
+        ) from None
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+        raise ValueError(
+            f"{path}: truncated, or not a torch file ({path.stat().st_size} bytes: {_first_line(error)})"
+        ) from None
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

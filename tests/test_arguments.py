@@ -31,6 +31,12 @@ def test_required_values_may_come_from_yaml(tmp_path):
     assert (args.model_name_or_path, args.overwrite_output_dir) == ("m", True)
 
 
+def test_yamls_bare_no_is_the_word(tmp_path):
+    config = write(tmp_path / "c.yaml", "mixed_precision: no\npush_to_hub: no\n")
+    args = parse_arguments([*config, *REQUIRED])
+    assert (args.mixed_precision, args.push_to_hub) == ("no", False)
+
+
 def test_config_yaml_of_a_run_reads_back(tmp_path):
     args = parse_arguments([*REQUIRED, "--checkpoint_at_steps", "3", "--retain", "4", "--size", "56x70"])
     again = parse_arguments(write(tmp_path / "c.yaml", args.to_yaml()))

@@ -7,14 +7,15 @@ import pytest
 import torch
 from peft import PeftModel
 from runs import arguments, train_again, weights
+from safetensors import SafetensorError
 from safetensors.torch import load_file
-from tiny import write_group, write_raw_tree
+from tiny import tiny_processor, write_group, write_raw_tree
 from transformers import AutoModelForDepthEstimation
 
 from gift_peft.data.gift_i import load_gift_i
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.losses import geometry_consistency_error
-from gift_peft.training import loop, start, train
+from gift_peft.training import checkpoints, loop, start, train
 from gift_peft.training.groups import PreparedGroups, epoch_order
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
@@ -54,7 +55,7 @@ def groups(base_dir, tree):
 
     def prepared(split):
         rows = load_gift_i(tree, split, teacher=base_dir, size=(56, 70))
-        return PreparedGroups(rows, loop.AutoImageProcessor.from_pretrained(base_dir), (56, 70), num_threads=0)
+        return PreparedGroups(rows, tiny_processor(), (56, 70), num_threads=0)
 
     return prepared
 
@@ -227,6 +228,27 @@ def test_a_dataset_without_train_groups(base_dir, tmp_path):
     with pytest.raises(ValueError, match=r"dataset_name: .*no train split"):
         train(arguments(base_dir, tmp_path / "raw", tmp_path / "out"))
     assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_model_without_a_recipe_is_told_how_to_spell_one(base_dir, tree, tmp_path, monkeypatch):
+    monkeypatch.setattr("gift_peft.adapters.RECIPES", {})
+    with pytest.raises(ValueError, match=r"model_name_or_path: no recipe .*target_modules, modules_to_save and pred"):
+        train(arguments(base_dir, tree, tmp_path / "out"))
+    with pytest.raises(ValueError, match="target_modules and modules_to_save: give both"):
+        train(arguments(base_dir, tree, tmp_path / "out", target_modules="x"))
+
+
+def test_a_disk_that_is_full_names_the_checkpoint(base_dir, tree, tmp_path, monkeypatch):
+    def full(tensors, path):
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    args = arguments(base_dir, tree, tmp_path / "out", max_steps=2)
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "save_file", full)
+        with pytest.raises(OSError, match=r"out/checkpoint-1 could not be written: .*No space left"):
+            train(args)
+    assert not list((tmp_path / "out").glob("*checkpoint*"))
+    assert train_again(args).step == 2
 
 
 def test_a_tracker_that_is_not_installed(base_dir, tree, tmp_path, monkeypatch):

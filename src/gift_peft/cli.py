@@ -67,6 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate = verb("evaluate", _evaluate, "compare base and adapter on validation groups")
     _add_model_and_data(evaluate)
     _add_adapter(evaluate)
+    evaluate.add_argument("--dataset_revision", help="branch, tag or commit of a hub dataset")
     evaluate.add_argument("--split", default="validation")
     evaluate.add_argument("--reference", choices=["proxy", "depth"], default="proxy", help="what to compare with")
     evaluate.add_argument("--protocol", help="default: native against proxies, gift against depth")
@@ -147,6 +148,7 @@ def _evaluate(args: argparse.Namespace, rest: list[str]) -> int:
         size=args.size,
         kind=args.kind,
         revision=args.revision,
+        dataset_revision=args.dataset_revision,
         color=sys.stdout.isatty() and "NO_COLOR" not in os.environ,
     )
     return 0

@@ -16,6 +16,7 @@ from gift_peft.data.preprocess import parse_size
 
 # What a run may be resumed with when it differs: everything else changes the weights that come out.
 FREE_TO_CHANGE = {
+    "model_revision",  # a name of the weights, which are compared themselves
     "dataset_name",  # the folder may move: its content is compared by fingerprint
     "proxies_dir",
     "output_dir",
@@ -83,7 +84,7 @@ class GiftTrainingArguments:
     )
     seed: int = _arg("seed of the LoRA initialisation and of the order of the groups", 0)
     dataloader_num_workers: int = _arg("threads that decode and resize the next groups", 2)
-    group_cache_gb: float = _arg("memory for groups kept at network size between epochs", 4.0)
+    group_cache_gb: float = _arg("memory per process for groups kept at network size between epochs", 4.0)
 
     checkpointing_steps: int | None = _arg("a checkpoint every so many updates; default: every epoch", None)
     checkpoints_total_limit: int | None = _arg("how many of the newest checkpoints are kept", 2)
@@ -178,11 +179,14 @@ def _yaml_to_argv(path: Path) -> list[str]:
     if not isinstance(values, dict):
         raise ValueError(f"config {path}: expected lines of the form `key: value`")
     argv = []
+    types = {f.name: f.type for f in fields(GiftTrainingArguments)}
     for key, value in values.items():
         if key not in _names() or key == "config":
             raise ValueError(f"config {path}: unknown key {key!r}{_nearest(str(key))}")
         if isinstance(value, dict):
             raise ValueError(f"config {path}: {key}: expected a value, not a mapping")
+        if isinstance(value, bool) and types[key] is not bool:
+            value = "yes" if value else "no"  # what YAML makes of `mixed_precision: no`
         if isinstance(value, list):
             argv += [f"--{key}", *map(str, value)] if value else []
         elif value is not None:

@@ -16,7 +16,8 @@ from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 
 UPLOADED = ["adapter_model.safetensors", "adapter_config.json", "gift.json", "preprocessor_config.json", "README.md"]
 PACKAGES = ("gift-peft", "torch", "transformers", "peft", "accelerate", "datasets")
-RECORDED = ("dataset_name", "num_train_epochs", "max_steps", "retain")  # and all that a resumed run may not change
+# And all that a resumed run may not change.
+RECORDED = ("model_revision", "dataset_name", "num_train_epochs", "max_steps", "retain")
 METRICS = {"mae": "MAE", "abs_rel": "AbsRel", "rmse": "RMSE", "delta1": "delta1 (%)"}
 # Checked on the Hub; only the small one may be used commercially.
 LICENSES = {

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 BEST = "best"
@@ -37,7 +38,8 @@ def write_checkpoint(
 
     `save(folder)` writes the adapter, `state` is JSON, `best` the best adapter's folder. OSError if writing fails.
     """
-    with new_folder(output_dir / f"checkpoint-{step}") as folder:
+    target = output_dir / f"checkpoint-{step}"
+    with disk_errors(target), new_folder(target) as folder:
         save(folder)
         save_file(optimizer_tensors(model, optimizer), folder / OPTIMIZER)
         save_file(_rng_tensors(), folder / RNG)
@@ -46,7 +48,7 @@ def write_checkpoint(
             shutil.copytree(best, folder / BEST, copy_function=_link_weights)
         sums = {str(f.relative_to(folder)): _digest(f) for f in _files(folder)}
         (folder / CHECKSUMS).write_text(json.dumps(sums, indent=1) + "\n", encoding="utf-8")
-    return output_dir / f"checkpoint-{step}"
+    return target
 
 
 def read_checkpoint(folder: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer) -> None:
@@ -141,6 +143,15 @@ def new_folder(target: Path):
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def disk_errors(target: Path):
+    """OSError naming `target` for what goes wrong on the disk; safetensors has an exception of its own for that."""
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        raise OSError(f"{target} could not be written: {error}") from error
 
 
 def remove_leftovers(output_dir: Path) -> None:

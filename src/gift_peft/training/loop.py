@@ -12,7 +12,6 @@ from pathlib import Path
 import torch
 from accelerate import Accelerator
 from accelerate.utils import broadcast_object_list, set_seed
-from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
 from gift_peft.adapters import GiftRecipe, get_gift_model, get_recipe, save_adapter
 from gift_peft.data.gift_i import dataset_fingerprint, gift_i_splits, load_gift_i, proxies_command
@@ -30,7 +29,7 @@ from gift_peft.training.groups import PreparedGroups, epoch_order
 from gift_peft.training.progress import Progress
 from gift_peft.training.start import check_run, claim_folder, make_accelerator, stop_signals
 from gift_peft.training.state import State, write_metrics
-from gift_peft.training.teacher import make_proxies
+from gift_peft.training.teacher import load_teacher, make_proxies
 
 
 @dataclass
@@ -95,12 +94,9 @@ class Run:
 
     def __init__(self, args: GiftTrainingArguments, output: Path, accelerator: Accelerator) -> None:
         self.args, self.output, self.accelerator = args, output, accelerator
-        source = {"revision": args.model_revision}
         # Float32 weights whatever the checkpoint's: bf16 is autocast's business (paper, implementation details).
-        base = AutoModelForDepthEstimation.from_pretrained(args.model_name_or_path, dtype=torch.float32, **source)
-        self.processor = AutoImageProcessor.from_pretrained(args.model_name_or_path, **source)
-        self.recipe = get_recipe(base, _generic_recipe(args))
-        self.kind = self.recipe.kind_for(base.config)
+        base, self.processor = load_teacher(args.model_name_or_path, args.model_revision)
+        self.recipe, self.kind = _recipe(args, base)
         self.model_type = base.config.model_type
         self.size = resolve_size(args.size, self.recipe, self.processor, base.config)
         self.train_groups, self.validation_groups = self._data()
@@ -331,25 +327,32 @@ class Run:
             dataset_fingerprint=self.identity["dataset_name"],
             metrics={"base": state.row_of(0), "adapter": state.row_of(state.step)},
         )
-        save_adapter(
-            self.model,
-            folder,
-            self.args.model_name_or_path,
-            self.args.model_revision,
-            processor=self.processor,
-            size=self.size,
-            gift=record,
-            card=card.model_card(self.args, record) if with_card else None,
-        )
+        with checkpoints.disk_errors(folder):
+            save_adapter(
+                self.model,
+                folder,
+                self.args.model_name_or_path,
+                self.args.model_revision,
+                processor=self.processor,
+                size=self.size,
+                gift=record,
+                card=card.model_card(self.args, record) if with_card else None,
+            )
 
 
-def _generic_recipe(args: GiftTrainingArguments) -> GiftRecipe | None:
-    """The recipe that the arguments spell out, for a model that has none."""
-    if not (args.target_modules or args.modules_to_save):
-        return None
-    if not (args.target_modules and args.modules_to_save):
-        raise ValueError("target_modules and modules_to_save: give both or neither")
-    return GiftRecipe(args.target_modules, args.modules_to_save, args.prediction_kind)
+def _recipe(args: GiftTrainingArguments, base: torch.nn.Module) -> tuple[GiftRecipe, str]:
+    """(recipe, what the model predicts): the one the arguments spell out, else the one for the model's type."""
+    spelled = None
+    if args.target_modules or args.modules_to_save:
+        if not (args.target_modules and args.modules_to_save):
+            raise ValueError("target_modules and modules_to_save: give both or neither")
+        spelled = GiftRecipe(args.target_modules, args.modules_to_save, args.prediction_kind)
+    try:
+        recipe = get_recipe(base, spelled)
+        return recipe, recipe.kind_for(base.config)
+    except ValueError as error:
+        names = "target_modules, modules_to_save and prediction_kind"
+        raise ValueError(f"model_name_or_path: {error} (as arguments: {names})") from None
 
 
 def _check_identity(before: dict, now: dict) -> None:

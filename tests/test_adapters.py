@@ -270,6 +270,24 @@ def test_generic_recipe(model_type, head, tmp_path):
     assert torch.equal(depth(again, pixels), before)
 
 
+def test_heads_whose_names_mean_more_to_peft():
+    """PEFT matches path endings: `head.head` in DPT's `head`, or a `camera_head` beside a `head`."""
+    model = get_gift_model(tiny_dpt(), recipe=GENERIC["dpt"][1])
+    assert set(model.peft_config["default"].modules_to_save) == {"neck", "head.head"}
+
+    class Two(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.encoder = nn.Linear(2, 2)
+            self.head = nn.Sequential(nn.Linear(2, 2))
+            self.camera_head = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
+
+    with pytest.raises(ValueError, match=r"PEFT would take 'head.0' for camera_head.0 as well"):
+        get_gift_model(Two(), recipe=GiftRecipe(["encoder"], ["head"], kind="depth"))
+    model = get_gift_model(Two(), recipe=GiftRecipe(["encoder"], ["camera_head"], kind="depth"))
+    assert {name.split(".")[0] for name in trainable(model)} == {"encoder", "camera_head"}
+
+
 def test_own_dropout_is_switched_off():
     model = get_gift_model(tiny_dpt().train(), recipe=GENERIC["dpt"][1])
     assert model.training
@@ -326,7 +344,7 @@ def test_bad_arguments(model):
     for targets in (["query"], r"encoder\.attention\.q_proj"):
         with pytest.raises(ValueError, match=r"target_modules: .* names no module of this DepthAnythingFor"):
             get_gift_model(model, recipe=GiftRecipe(targets, ["head"]))
-    with pytest.raises(ValueError, match="'head' also matches relative_head, metric_head"):
+    with pytest.raises(ValueError, match=r"has no module 'head' \(there are relative_head, metric_head\)"):
         get_gift_model(tiny_zoedepth(), recipe=GiftRecipe(["query"], ["head"]))
     with pytest.raises(ValueError, match="already has an adapter"):
         get_gift_model(get_gift_model(model))

@@ -106,17 +106,16 @@ def get_gift_model(model: nn.Module, rank: int = 8, head: str = "full", recipe: 
         raise ValueError(f"head must be one of {', '.join(HEADS)}, got {head!r}")
     recipe = get_recipe(model, recipe)
     _check_base(model)
-    saved = {name: _modules_named(model, name) for name in recipe.modules_to_save} if head != "none" else {}
+    saved = _head_modules(model, recipe.modules_to_save) if head != "none" else []
     targets = recipe.target_modules
     if not any(re.fullmatch(_pattern(targets), name) for name, _ in model.named_modules()):
         raise ValueError(f"target_modules: {targets!r} names no module of this {type(model).__name__}")
     if head == "lora":
-        roots = [root for found in saved.values() for root in found]
-        targets = "|".join([f"({_pattern(targets)})", *map(re.escape, _lora_layers(model, roots))])
+        targets = "|".join([f"({_pattern(targets)})", *map(re.escape, _lora_layers(model, saved))])
     config = LoraConfig(
         r=rank,
         target_modules=targets,
-        modules_to_save=list(recipe.modules_to_save) if head == "full" else None,
+        modules_to_save=saved if head == "full" else None,
         **recipe.lora,
     )
     check_lora_config(config)
@@ -228,14 +227,34 @@ def _check_base(model: nn.Module) -> None:
             )
 
 
-def _modules_named(model: nn.Module, name: str) -> list[str]:
-    """Modules that PEFT would save for `name`; it matches bare name endings, which may be more than was meant."""
-    found = [key for key, _ in model.named_modules() if key.endswith(name)]
-    if not found:
-        raise ValueError(f"modules_to_save: the model has no module {name!r}")
-    if unwanted := [key for key in found if key != name and not key.endswith(f".{name}")]:
-        raise ValueError(f"modules_to_save: {name!r} also matches {', '.join(unwanted)}; write a longer name")
-    return found
+def _head_modules(model: nn.Module, names: list[str]) -> list[str]:
+    """Full paths of the modules called `names`, so written that PEFT finds these and no others.
+
+    PEFT takes every module whose path ends with a given text: `head` means `metric_head` as well, and the `head.head`
+    inside `head`, which it would wrap twice. Such a module is written as its parts.
+    """
+    keys = [key for key, _ in model.named_modules()]
+    wanted = []
+    for name in names:
+        found = [key for key in keys if key == name or key.endswith(f".{name}")]
+        if not found:
+            similar = [key for key in keys if key.endswith(name)]
+            hint = f" (there are {', '.join(similar[:4])})" if similar else ""
+            raise ValueError(f"modules_to_save: the model has no module {name!r}{hint}")
+        wanted += found
+    outer = [key for key in dict.fromkeys(wanted) if not any(key.startswith(f"{other}.") for other in wanted)]
+    return [path for key in outer for path in _unambiguous(model, key, keys, outer)]
+
+
+def _unambiguous(model: nn.Module, path: str, keys: list[str], wanted: list[str]) -> list[str]:
+    others = [key for key in keys if key.endswith(path) and key != path and key not in wanted]
+    if not others:
+        return [path]
+    module = model.get_submodule(path)
+    parts = [name for name, child in module.named_children() if next(child.parameters(), None) is not None]
+    if not parts or next(module.parameters(recurse=False), None) is not None:
+        raise ValueError(f"modules_to_save: PEFT would take {path!r} for {', '.join(others[:4])} as well")
+    return [found for part in parts for found in _unambiguous(model, f"{path}.{part}", keys, wanted)]
 
 
 def _lora_layers(model: nn.Module, roots: list[str]) -> list[str]:

@@ -1,0 +1,57 @@
+"""Depth models that transformers does not have: VGGT and Metric3D V2.
+
+`import gift_peft` makes transformers' Auto classes know them. Where transformers is not imported yet, this waits until
+it is: torch takes longer to import than the command line takes to answer --help.
+"""
+
+import importlib.machinery
+import sys
+
+HOST = "transformers"
+
+
+def register_models() -> None:
+    """Register both architectures with AutoConfig, AutoModelForDepthEstimation and AutoImageProcessor. Idempotent.
+
+    At once if transformers is imported, else as soon as it has been.
+    """
+    if HOST in sys.modules:
+        _register()
+    elif not any(isinstance(finder, _AfterImport) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _AfterImport())
+
+
+class _AfterImport:
+    """An import finder that finds transformers where it is, and registers the models once it has been executed."""
+
+    def find_spec(self, name, path=None, target=None):
+        if name != HOST:
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def exec_module(module):
+                execute(module)
+                _register()
+
+            spec.loader.exec_module = exec_module
+        return spec
+
+
+def _register() -> None:
+    from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation, AutoVideoProcessor
+
+    from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
+    from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil
+
+    for config, model, processor in (
+        (VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil),
+        (Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil),
+    ):
+        AutoConfig.register(config.model_type, config, exist_ok=True)
+        AutoModelForDepthEstimation.register(config, model, exist_ok=True)
+        AutoImageProcessor.register(config, image_processor_classes={"pil": processor}, exist_ok=True)
+        # Pipelines take any remote image processor for a video processor too and would ask before running its code.
+        AutoVideoProcessor.register(config, video_processor_classes={}, exist_ok=True)

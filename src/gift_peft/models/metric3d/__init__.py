@@ -1,0 +1,14 @@
+"""Metric3D V2 (Hu et al., 2024), Small, Large and Giant2, as a transformers model.
+
+Saved folders carry these files, so that they also load with `trust_remote_code=True` where gift-peft is not installed.
+"""
+
+from .configuration_metric3d import Metric3DConfig
+from .image_processing_metric3d import Metric3DImageProcessorPil
+from .modeling_metric3d import Metric3DForDepthEstimation
+
+__all__ = ["Metric3DConfig", "Metric3DForDepthEstimation", "Metric3DImageProcessorPil"]
+
+Metric3DConfig.register_for_auto_class()
+Metric3DForDepthEstimation.register_for_auto_class("AutoModelForDepthEstimation")
+Metric3DImageProcessorPil.register_for_auto_class("AutoImageProcessor")

@@ -67,6 +67,8 @@ def _depth_path(content: object, where: str) -> dict[str, torch.Tensor]:
     for key, value in state.items():
         if not isinstance(value, torch.Tensor):
             raise ValueError(f"{where}: {key} is a {type(value).__name__}, not a tensor")
+        if not value.is_floating_point():
+            raise ValueError(f"{where}: {key} holds {value.dtype}, not floating-point weights")
     return state
 
 
@@ -104,7 +106,7 @@ def _read_torch(path: Path) -> object:
         raise ValueError(
             f"{path}: refused, it holds more than tensors and would run code, or is damaged ({_first_line(error)})"
         ) from None
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+    except (RuntimeError, EOFError, OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path}: truncated, or not a torch file ({path.stat().st_size} bytes: {_first_line(error)})"
         ) from None

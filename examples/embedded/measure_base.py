@@ -27,7 +27,7 @@ def treated_references(model, processor, groups) -> dict[str, list[dict]]:
         depth = np.asarray(row["depths"][0]).astype(float)
         with torch.no_grad():
             output = model(pixel_values=to_pixel_values([row["reference"]], processor, SIZE)).predicted_depth
-        predicted = resize_prediction(output[0].numpy(), depth.shape)
+        predicted = resize_prediction(output[0], depth.shape)
         aligned = align(predicted, depth, depth > 0, "gift", "inverse_depth").aligned
         target = np.asarray(row["masks"][0]) > 127
         rows.setdefault(row["group_id"].split("_")[0], []).append(depth_metrics(aligned, depth, target))

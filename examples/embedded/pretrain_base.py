@@ -1,6 +1,6 @@
 """Pre-train the embedded base model from scratch on the opaque renders: two million weights, inverse depth in 1/m.
 
-    python examples/embedded/pretrain_base.py --renders renders/base --out renders/model --steps 6000
+    python examples/embedded/pretrain_base.py --renders renders/base --out renders/model --steps 4500
 
 Weighted L1 and a multi-scale gradient loss on inverse depth, AdamW with a one-cycle schedule, flips and colour jitter,
 an exponential average of the weights, bf16 autocast. The first `--held_out` scenes are never trained on; every 500
@@ -145,7 +145,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--renders", type=Path, default=Path("renders/base"))
     parser.add_argument("--out", type=Path, default=Path("renders/model"))
-    parser.add_argument("--steps", type=int, default=6000)
+    parser.add_argument("--steps", type=int, default=4500)
     parser.add_argument("--batch", type=int, default=24)
     parser.add_argument("--learning_rate", type=float, default=1.2e-3)
     parser.add_argument("--held_out", type=int, default=100, help="scenes")

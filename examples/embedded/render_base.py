@@ -1,7 +1,7 @@
 """Render the pictures that the embedded base model is pre-trained on: rooms WITHOUT any mirror or glass.
 
     pip install -e ".[render]"
-    python examples/embedded/render_base.py --out renders/base --count 5000 --processes 2
+    python examples/embedded/render_base.py --out renders/base --count 4000 --processes 2
 
 Opaque twins of every kind of target stand where the groups have their mirrors, panes and glass objects, as do empty
 frames and doorways one really can look through. One .npz per scene (two views each): `image` (2, 140, 175, 3) uint8
@@ -94,7 +94,7 @@ def work(task) -> int:
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("renders/base"))
-    parser.add_argument("--count", type=int, default=5000, help="pictures, two per scene")
+    parser.add_argument("--count", type=int, default=4000, help="pictures, two per scene")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)

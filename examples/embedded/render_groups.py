@@ -42,14 +42,19 @@ def clutter(rng, count, x_range, y_range) -> list[rooms.Item]:
     return items
 
 
+def printed(rng) -> np.ndarray:
+    """Half of the cards, sheets and fillings are plain."""
+    return textures.card(rng) if rng.random() < 0.5 else textures.mottled(rng, textures.colour(rng, 0.1, 0.9), 0.05)
+
+
 def sheet(rng, flat: targets.Flat, offset: float) -> list[rooms.Item]:
     """Paper or card on the target's plane, `offset` metres towards the camera; mostly over all of it."""
     u, v, centre = flat.u, flat.v, flat.centre + flat.normal * offset
-    if rng.random() < 0.3:
+    if rng.random() < 0.2:
         share = rng.uniform(0.6, 0.9)
         centre = centre + rng.choice([-1, 1]) * (1 - share) * u
         u = u * share
-    return [rooms.quad(centre, u, v, textures.card(rng))]
+    return [rooms.quad(centre, u, v, printed(rng))]
 
 
 def smudges(rng, scene, flat: targets.Flat) -> np.ndarray:
@@ -78,17 +83,21 @@ def fresnel(scene, flat: targets.Flat) -> np.ndarray:
 
 def plan(rng, kind: str):
     """A furnished room around one target, the camera turned to it."""
-    scene = rooms.make_room(rng, (2.4, 4.6))
-    if kind == "mirror":
-        place = targets.wall_panel if rng.random() < 0.6 else lambda r, s: targets.standing_panel(r, s, False)
-        target = place(rng, scene)
+    if kind == "mirror" and rng.random() < 0.45:
+        scene = rooms.make_room(rng, (2.0, 3.2))
+        target = targets.wall_panel(rng, scene)
+    elif kind == "mirror":
+        scene = rooms.make_room(rng, (2.6, 5.0))
+        target = targets.standing_panel(rng, scene, False, 2.3)
     elif kind == "pane":
-        target = targets.standing_panel(rng, scene, True)
+        scene = rooms.make_room(rng, (3.6, 6.0))
+        target = targets.standing_panel(rng, scene, True, 2.3)
         if target is not None and len(target.holder) == 2:  # frameless: the cut edge of the glass is green
             rim = targets.border(rng, target.centre, target.u, target.v, 0.014, 0.012)
             tone = np.array([0.06, 0.16, 0.1], np.float32) * rng.uniform(0.6, 1.8)
             target.holder += [rooms.Item(bar.shape, tone, bar.points) for bar in rim]
     else:
+        scene = rooms.make_room(rng, (2.8, 5.5))
         target = targets.table_object(rng, scene)
     if target is None:
         return None
@@ -128,7 +137,8 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
         return radiance, tracer.z_depth(scene, [*items, black])
 
     if kind == "pane":
-        x, y = target.centre[:2] - target.normal[:2] * rng.uniform(0.45, 1.2)
+        room_behind = (scene.room[3] - 0.6 - target.centre[1]) / max(-target.normal[1], 0.5)
+        x, y = target.centre[:2] - target.normal[:2] * rng.uniform(0.7, max(0.8, min(2.4, room_behind)))
         moved = clutter(rng, rng.integers(1, 3), (x - 0.35, x + 0.35), (y, y + 0.5))
         card = sheet(rng, target, -0.003) if shown else []
         direct, albedo, _ = tracer.shade(scene, [*items, *moved, *card])
@@ -152,9 +162,7 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
         )
         moved += rooms.small_thing(rng, *spot, z if target.holder else 0.0, scale=0.9)
     if shown:
-        look = (
-            textures.card(rng) if rng.random() < 0.4 else textures.mottled(rng, textures.colour(rng, 0.05, 0.9), 0.04)
-        )
+        look = printed(rng)
         body = target.body(look, float(rng.uniform(0.04, 0.15)))
         direct, albedo, _ = tracer.shade(scene, [*items, *moved, body])
         return lit(direct, albedo), tracer.z_depth(scene, [*items, *moved, body])
@@ -261,6 +269,7 @@ def main():
                 seed = FIRST_SEED[split] + (number * 1000 + index) * 200
                 if not folder.exists():
                     tasks.append((folder, kind, seed))
+    tasks.sort(key=lambda task: (task[0].parent.name, task[0].name.rsplit("_")[1]))  # all kinds from the start
     with ProcessPoolExecutor(args.processes) as pool:
         list(tqdm(pool.map(work, tasks), total=len(tasks), unit="group"))
 

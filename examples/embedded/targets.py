@@ -103,13 +103,13 @@ def wall_panel(rng, scene: Scene) -> Flat:
     return Flat(centre, u, v, holder)
 
 
-def standing_panel(rng, scene: Scene, see_through: bool) -> Flat | None:
-    """On the floor, 1.3 to 3 m away: a leaning framed panel, or (see_through) an upright pane on feet."""
+def standing_panel(rng, scene: Scene, see_through: bool, farthest: float = 3.2) -> Flat | None:
+    """On the floor, 1.3 to `farthest` m away: a leaning framed panel, or (see_through) an upright pane on feet."""
     left, right, _, far, _ = scene.room
     width = rng.uniform(0.6, 1.3) if see_through else rng.uniform(0.45, 1.0)
     height = rng.uniform(0.9, 1.7)
     nearest = 1.5 if width > 0.9 else 1.3
-    reach = max(nearest + 0.1, min(3.2, far - (0.9 if see_through else 0.5)))
+    reach = max(nearest + 0.1, min(farthest, far - (0.9 if see_through else 0.5)))
     spot = rooms.free_spot(rng, scene, width / 2, (max(left + 0.5, -1.1), min(right - 0.5, 1.1)), (nearest, reach))
     if spot is None:
         return None

@@ -41,7 +41,8 @@ class _AfterImport:
 
 
 def _register() -> None:
-    from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation, AutoVideoProcessor
+    from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation
+    from transformers.models.auto.video_processing_auto import AutoVideoProcessor  # the top level asks for torchvision
 
     from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
     from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil

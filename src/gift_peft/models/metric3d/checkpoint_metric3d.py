@@ -71,7 +71,9 @@ def fit_official(
 
 
 def _named_tensors(content: object, where: str) -> dict[str, torch.Tensor]:
-    while isinstance(content, Mapping) and (inner := [key for key in WRAPPERS if isinstance(content.get(key), Mapping)]):
+    while isinstance(content, Mapping) and (
+        inner := [key for key in WRAPPERS if isinstance(content.get(key), Mapping)]
+    ):
         content = content[inner[0]]
     if not isinstance(content, Mapping):
         raise ValueError(f"{where}: holds a {type(content).__name__}, not tensors by name")

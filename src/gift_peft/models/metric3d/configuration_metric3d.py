@@ -1,4 +1,4 @@
-"""Configuration of Metric3D V2 (Hu et al., 2024): a DINOv2 encoder with registers, a RAFT-style depth and normal decoder.
+"""Configuration of Metric3D V2 (Hu et al., 2024): DINOv2 encoder with registers, recurrent depth and normal decoder.
 
 A variant names the sizes of a released model; single fields may be given beside it.
 """
@@ -43,17 +43,18 @@ class Metric3DConfig(PreTrainedConfig):
     Sizes left out are those of `variant`.
 
     Args:
-        variant (`str`, *optional*, defaults to `"giant2"`): `"small"`, `"large"` or `"giant2"`. Giant2 gives the decoder
-            the tokens after each quarter of its blocks, not normalised; the others the normalised last ones four times.
+        variant (`str`, *optional*, defaults to `"giant2"`): `"small"`, `"large"` or `"giant2"`. Giant2 gives the
+            decoder the tokens after each quarter of its blocks, not normalised; the others four times the normalised
+            last ones.
         embed_dim (`int`, *optional*): width of the tokens.
         depth (`int`, *optional*): number of encoder blocks.
         num_heads (`int`, *optional*): attention heads of a block.
         patch_size (`int`, *optional*, defaults to 14): side of a patch in pixels.
         num_register_tokens (`int`, *optional*, defaults to 4): tokens between the class token and the patches.
         pos_image_size (`int`, *optional*, defaults to 518): image side of the stored position embedding.
-        feature_channels (`list[int]`, *optional*): widths of the feature maps at 1/4, 1/7, 1/14; the fourth is unused.
+        feature_channels (`list[int]`, *optional*): widths of the feature maps at 1/4, 1/7, 1/14; the last is unused.
         decoder_channels (`list[int]`, *optional*): (unused, 1/4, 1/7, 1/14, 1/14) widths of the fusion.
-        hidden_channels (`list[int]`, *optional*): widths of the recurrent states at 1/4, 1/7, 1/14; the fourth is unused.
+        hidden_channels (`list[int]`, *optional*): of the recurrent states at 1/4, 1/7, 1/14; the last is unused.
         iters (`int`, *optional*): updates of the recurrent decoder.
         depth_min, depth_max (`float`, *optional*, defaults to 0.1 and 200.0): range of canonical depth in metres.
         mlp_ratio (`int`, *optional*, defaults to 4): hidden width of a block's MLP over `embed_dim`.

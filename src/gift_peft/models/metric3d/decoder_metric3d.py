@@ -1,5 +1,5 @@
-"""Decoder of Metric3D V2: tokens become feature maps, a DPT makes a first depth and normal, convolutional GRUs at three
-scales refine both (RAFT-Stereo's recurrence), and a learned convex combination brings them to four times the size.
+"""Decoder of Metric3D V2: tokens become feature maps, a DPT makes a first depth and normal, convolutional GRUs at
+three scales refine both (RAFT-Stereo's recurrence), and a learned convex combination enlarges them four times.
 
 The state of the recurrence has six channels at 1/4 of the image: depth as (metres - depth_max) / regress_scale, depth
 confidence, the normal's x, y, z, and its concentration kappa. It stays in full precision under autocast.
@@ -27,7 +27,7 @@ class Metric3DPrediction(NamedTuple):
 
 
 class Metric3DDecoderOutput(NamedTuple):
-    """The last prediction, all of them if they were asked for (oldest first), and the initial state's reading at 1/4."""
+    """The last prediction, all of them if asked for (oldest first), and the initial state's reading at 1/4."""
 
     last: Metric3DPrediction
     every: list[Metric3DPrediction]
@@ -174,7 +174,7 @@ class Metric3DResidualBlock(nn.Module):
 
 
 class Metric3DContextEncoder(nn.Module):
-    """Start (branch 0) and context (branch 1) of the recurrent states at 1/4, 1/7 and 1/14, before their activations."""
+    """Start (branch 0) and context (branch 1) of the states at 1/4, 1/7 and 1/14, before their activations."""
 
     def __init__(self, config: Metric3DConfig):
         super().__init__()
@@ -224,7 +224,7 @@ class Metric3DFlowHead(nn.Module):
 
 
 class Metric3DUpdateBlock(GradientCheckpointingLayer):
-    """One update of the three recurrent states (1/4, 1/7, 1/14), coarse ones more often, and the change of the state."""
+    """One update of the recurrent states (1/4, 1/7, 1/14), coarse ones more often, and the change of the flow."""
 
     def __init__(self, config: Metric3DConfig):
         super().__init__()

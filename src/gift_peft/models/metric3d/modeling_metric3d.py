@@ -89,7 +89,7 @@ class Metric3DForDepthEstimation(PreTrainedModel):
 
         Args: `source` a `.safetensors`, `.pt` or `.pth` file, or tensors by official name (they are copied); `config`
         its sizes, without it those of the released variant of that width.
-        Raises FileNotFoundError, and ValueError naming the first tensor that does not fit or what is wrong in the file.
+        Raises FileNotFoundError, and ValueError naming the first tensor that does not fit, or the file's damage.
         """
         where = "the given dict" if isinstance(source, Mapping) else str(source)
         state = read_official(source)
@@ -173,9 +173,8 @@ def _released_config(state: Mapping[str, torch.Tensor], where: str) -> Metric3DC
     for variant, sizes in VARIANTS.items():
         if sizes["embed_dim"] == width:
             return Metric3DConfig(variant=variant)
-    raise ValueError(
-        f"{where}: {WIDTH} has shape {tuple(state[WIDTH].shape)}, which is none of {', '.join(VARIANTS)}; give a config"
-    )
+    shape = tuple(state[WIDTH].shape)
+    raise ValueError(f"{where}: {WIDTH} has shape {shape}, which is none of {', '.join(VARIANTS)}; give a config")
 
 
 __all__ = ["Metric3DDepthEstimatorOutput", "Metric3DForDepthEstimation"]

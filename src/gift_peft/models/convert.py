@@ -1,0 +1,99 @@
+"""Official weights to a transformers folder (`gift-peft convert vggt|metric3d SRC DST`).
+
+The folder has config, safetensors, image processor and the model's own code, so that it also loads with
+`trust_remote_code=True`. It appears when it is complete, or not at all.
+"""
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from transformers import PreTrainedConfig, PreTrainedModel
+
+from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
+from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil
+
+# What a hub id without a file means: facebook/VGGT-1B, JUGGHM/Metric3D.
+VGGT_FILE = "model.safetensors"
+METRIC3D_FILE = "metric_depth_vit_giant2_800k.pth"
+HUB_ID = re.compile(r"(?P<repo>[\w.-]+/[\w.-]+)(/(?P<file>[\w./-]+))?")
+
+
+def convert_vggt(source: str | Path, folder: str | Path, config: VggtConfig | str | Path | None = None) -> Path:
+    """Write `folder` from official VGGT weights; returns it.
+
+    Args:
+        source: a `.safetensors`, `.pt` or `.pth` file, or on the hub `owner/repo` or `owner/repo/file`.
+        folder: new, or empty.
+        config (*optional*): sizes, as an object or a JSON file; default VGGT-1B.
+
+    Raises:
+        FileNotFoundError: no such file here or on the hub.
+        ValueError: the file is damaged, no VGGT, or of another size; `folder` is not empty.
+    """
+    return _convert(VggtForDepthEstimation, VggtImageProcessorPil(), _fetch(source, VGGT_FILE, folder), folder, config)
+
+
+def convert_metric3d(
+    source: str | Path, folder: str | Path, config: Metric3DConfig | str | Path | None = None
+) -> Path:
+    """Write `folder` from official Metric3D V2 weights; returns it.
+
+    As `convert_vggt`. Without `config` the weights' width tells Small, Large and Giant2 apart; `JUGGHM/Metric3D` alone
+    is Giant2.
+    """
+    source = _fetch(source, METRIC3D_FILE, folder)
+    return _convert(Metric3DForDepthEstimation, Metric3DImageProcessorPil(), source, folder, config)
+
+
+CONVERTERS = {"vggt": convert_vggt, "metric3d": convert_metric3d}
+
+
+def _fetch(source: str | Path, default: str, folder: str | Path) -> Path:
+    """The local file of `source`, downloaded if it is on the hub; after a look at `folder`, which costs less."""
+    _check_free(Path(folder))
+    path, match = Path(source), HUB_ID.fullmatch(str(source))
+    if path.exists() or match is None or (path.suffix in (".safetensors", ".pt", ".pth") and not match["file"]):
+        return path  # from_official says if there is none
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import HfHubHTTPError
+
+    file = match["file"] or default
+    try:
+        return Path(hf_hub_download(match["repo"], file))
+    except (OSError, ValueError, HfHubHTTPError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise FileNotFoundError(
+            f"{source}: no such file, and {file} of {match['repo']} does not come from the hub ({reason})"
+        ) from None
+
+
+def _check_free(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} already exists: name a new folder")
+
+
+def _convert(
+    model_class: type[PreTrainedModel], processor: Any, source: Path, folder: str | Path, config: Any
+) -> Path:
+    folder = Path(folder)
+    if config is not None and not isinstance(config, PreTrainedConfig):
+        config = model_class.config_class.from_json_file(config)
+    model = model_class.from_official(source, config)
+    temporary = folder.with_name(f".{folder.name}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    try:
+        model.save_pretrained(temporary)
+        processor.save_pretrained(temporary)
+        _check_free(folder)
+        if folder.exists():
+            folder.rmdir()
+        temporary.rename(folder)
+    except SafetensorError as error:  # a full disk, which is no OSError there
+        raise OSError(f"{folder}: the weights cannot be written ({error})") from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return folder

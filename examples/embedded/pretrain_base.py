@@ -1,6 +1,8 @@
 """Pre-train the embedded base model from scratch on the opaque renders: two million weights, inverse depth in 1/m.
 
-    python examples/embedded/pretrain_base.py --renders renders/base --out renders/model --steps 4500
+    python examples/embedded/pretrain_base.py --out renders/first --scenes 2004 --steps 4500
+    python examples/embedded/pretrain_base.py --out renders/model --init renders/first/base --steps 2000 \\
+        --learning_rate 6e-4
 
 Weighted L1 and a multi-scale gradient loss on inverse depth, AdamW with a one-cycle schedule, flips and colour jitter,
 an exponential average of the weights, bf16 autocast. The first `--held_out` scenes are never trained on; every 500
@@ -148,16 +150,19 @@ def main():
     parser.add_argument("--steps", type=int, default=4500)
     parser.add_argument("--batch", type=int, default=24)
     parser.add_argument("--learning_rate", type=float, default=1.2e-3)
+    parser.add_argument("--scenes", type=int, help="use the first so many scenes only; default: all")
+    parser.add_argument("--init", type=Path, help="start from this model instead of from scratch")
     parser.add_argument("--held_out", type=int, default=100, help="scenes")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
 
-    paths = sorted(args.renders.glob("[0-9]*[0-9].npz"))
+    paths = sorted(args.renders.glob("[0-9]*[0-9].npz"))[: args.scenes]
     pictures, inverse = load(paths[args.held_out :])
     test = load(paths[: args.held_out])
     torch.manual_seed(args.seed)
-    model = build_model().to(memory_format=torch.channels_last)  # convolutions are faster so
+    model = DepthAnythingForDepthEstimation.from_pretrained(args.init) if args.init else build_model()
+    model = model.to(memory_format=torch.channels_last)  # convolutions are faster so
     average = build_model().to(memory_format=torch.channels_last)
     average.load_state_dict(model.state_dict())
     print(f"{sum(p.numel() for p in model.parameters()) / 1e6:.2f} M weights, {len(pictures)} pictures")

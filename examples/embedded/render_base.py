@@ -1,7 +1,7 @@
 """Render the pictures that the embedded base model is pre-trained on: rooms WITHOUT any mirror or glass.
 
     pip install -e ".[render]"
-    python examples/embedded/render_base.py --out renders/base --count 4000 --processes 2
+    python examples/embedded/render_base.py --out renders/base --count 5400 --processes 2
 
 Opaque twins of every kind of target stand where the groups have their mirrors, panes and glass objects, as do empty
 frames and doorways one really can look through. One .npz per scene (two views each): `image` (2, 140, 175, 3) uint8
@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
+
+FIRST_NEAR = 2004  # the seeds below it are rooms at large
 
 
 def opaque_scene(rng):
@@ -56,15 +58,41 @@ def opaque_scene(rng):
     return scene
 
 
+def near_scene(rng):
+    """A room as planned for a group, the twin (or, for one pane in six, nothing) in the target's place; its centre."""
+    import render_groups
+    import rooms
+    import targets
+
+    kind = rng.choice(["mirror", "pane", "solid"], p=[0.3, 0.3, 0.4])
+    planned = None
+    while planned is None:
+        planned = render_groups.plan(rng, kind)
+    scene, target = planned
+    look = [targets.treated, render_groups.printed, rooms.twin_texture][rng.integers(3)](rng)
+    if kind == "solid":
+        scene.items.append(target.body(look, float(rng.uniform(0.04, 0.3)) if rng.random() < 0.6 else None))
+    elif kind == "mirror" or rng.random() < 5 / 6:
+        scene.items.append(target.panel(look))
+    return scene, target.centre
+
+
 def views(seed: int):
-    """Two pictures and z-depths of one scene: the planned view and one turned away, each with its own light."""
+    """Two pictures and z-depths of one scene, each with its own light: the planned view and one turned away.
+
+    From `FIRST_NEAR` on the scenes are near ones, and the second view only shifts the target within the picture.
+    """
+    import targets
     import tracer
 
     rng = np.random.default_rng([20260101, seed])
-    scene = opaque_scene(rng)
+    scene, centre = near_scene(rng) if seed >= FIRST_NEAR else (opaque_scene(rng), None)
     images, depths = [], []
     for view in range(2):
-        if view:
+        if view and centre is not None:
+            scene.camera.origin = np.array([0.0, 0.0, rng.uniform(1.2, 1.5)])
+            targets.aim(rng, scene, centre)
+        elif view:
             yaw, pitch = rng.uniform(-0.5, 0.5), rng.uniform(-0.4, -0.02)
             direction = [np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)]
             scene.camera.forward = np.array(direction)
@@ -94,7 +122,7 @@ def work(task) -> int:
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("renders/base"))
-    parser.add_argument("--count", type=int, default=4000, help="pictures, two per scene")
+    parser.add_argument("--count", type=int, default=5400, help="pictures, two per scene")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)

@@ -43,14 +43,14 @@ def clutter(rng, count, x_range, y_range) -> list[rooms.Item]:
 
 
 def printed(rng) -> np.ndarray:
-    """Half of the cards, sheets and fillings are plain."""
-    return textures.card(rng) if rng.random() < 0.5 else textures.mottled(rng, textures.colour(rng, 0.1, 0.9), 0.05)
+    """What covers or fills a target: mostly plain."""
+    return textures.card(rng) if rng.random() < 0.3 else textures.mottled(rng, textures.colour(rng, 0.1, 0.9), 0.05)
 
 
 def sheet(rng, flat: targets.Flat, offset: float) -> list[rooms.Item]:
     """Paper or card on the target's plane, `offset` metres towards the camera; mostly over all of it."""
     u, v, centre = flat.u, flat.v, flat.centre + flat.normal * offset
-    if rng.random() < 0.2:
+    if rng.random() < 0.1:
         share = rng.uniform(0.6, 0.9)
         centre = centre + rng.choice([-1, 1]) * (1 - share) * u
         u = u * share
@@ -210,16 +210,17 @@ def make_group(seed: int, kind: str):
     direct, albedo, _ = tracer.shade(scene, [*scene.items, matte])
     reference = lamp * direct + ambient * albedo
     exposure = tracer.auto_exposure(reference)
-    count = int(rng.integers(3, 8)) if rng.random() < 0.9 else int(rng.integers(8, 10))
-    hidden = max(1, round(count / 3))
+    count = int(rng.choice([3, 4, 5, 6, 7, 8, 9], p=[0.1, 0.2, 0.25, 0.2, 0.15, 0.05, 0.05]))
+    hidden = max(1, count // 3)
     shown = rng.permutation([True] * (count - hidden) + [False] * hidden)
     images, depths = [], []
     for surface_seen in shown:
-        light = (lamp * rng.uniform(0.75, 1.25), ambient * rng.uniform(0.75, 1.25))
+        spread = 0.12 if surface_seen else 0.25  # dim and bright
+        light = (lamp * rng.uniform(1 - spread, 1 + spread), ambient * rng.uniform(1 - spread, 1 + spread))
         radiance, depth = observe(rng, kind, scene, target, alpha, bool(surface_seen), light)
         if not np.isfinite(radiance).all() or depth.min() < 0.25 or depth.max() > 30:
             return None
-        images.append(tracer.develop(radiance, exposure * rng.uniform(0.75, 1.25)))
+        images.append(tracer.develop(radiance, exposure * rng.uniform(1 - spread, 1 + spread)))
         depths.append(np.round(depth * 1000).astype(np.uint16))
     return {
         "images": images,

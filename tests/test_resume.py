@@ -186,9 +186,7 @@ def test_a_longer_run_has_the_shorter_as_its_beginning(args, base_dir, tree, who
     assert len((longer / "metrics.jsonl").read_text().splitlines()) == 4
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("learning_rate", 1e-3), ("seed", 5), ("lora_rank", 2), ("lambda_d", 0.5), ("head", "lora")]
-)
+@pytest.mark.parametrize(("name", "value"), [("learning_rate", 1e-3), ("seed", 5), ("head", "lora")])
 def test_other_arguments_are_refused_by_name_and_nothing_is_written(name, value, args, whole, tmp_path):
     shutil.copytree(whole, tmp_path / "out")
     before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}

@@ -174,7 +174,11 @@ def _predict(args: argparse.Namespace, rest: list[str]) -> int:
 def _quiet() -> None:
     """Our own lines and bars are enough; those of the libraries come back with --debug."""
     os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
-    os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
-    os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
     warnings.filterwarnings("ignore", category=FutureWarning)  # between transformers and peft, nothing a user can do
     warnings.formatwarning = lambda message, *_, **__: f"gift-peft: warning: {message}\n"
+    if not sys.stderr.isatty():  # on a terminal the bars of a download are wanted
+        import datasets
+        import huggingface_hub
+
+        datasets.disable_progress_bars()
+        huggingface_hub.utils.disable_progress_bars()

@@ -3,6 +3,7 @@
 Neither record nor card holds a path of this machine; a local base or dataset appears by its folder's name only.
 """
 
+import functools
 import platform
 from dataclasses import asdict
 from importlib.metadata import version
@@ -46,10 +47,15 @@ def run_record(args: GiftTrainingArguments, **about) -> dict:
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{platform.machine()} CPU"
     return {
         "arguments": arguments,
-        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        "versions": _versions(),
         "device": device,
         **about,
     }
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
 
 
 def model_card(args: GiftTrainingArguments, record: dict) -> str:

@@ -487,7 +487,7 @@ def write_bad(folder: Path, kind: str, official) -> Path:
     elif kind == "code":
         torch.save({"model": Runs()}, path)
     elif kind == "pickle":
-        path.write_bytes(pickle.dumps({"a": Runs()}))
+        path.write_bytes(pickle.dumps({"a": Runs()}, protocol=2))
     elif kind == "other":
         torch.save({"depth_model.encoder.cls_token": torch.zeros(1)}, path)
     elif kind == "list":

@@ -14,8 +14,6 @@ from gift_peft.adapters import get_gift_model
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import gift_loss
 
-# peft 0.21 reads an attribute that transformers 5.23 deprecates
-pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
 
 SIZE = (28, 28)
 COUNTS, CUTS = (2, 3, 5, 9), (1, 2, 4)
@@ -347,6 +345,11 @@ def train(model, accelerator, dtype):
     return {name: p.detach().clone() for name, p in model.named_parameters() if p.requires_grad}
 
 
+def retained(name, count):
+    """Whether a graph was kept matters to the bits alone, so one precision will do."""
+    return (0, 2, count) if name == "float64" else (0,)
+
+
 def message_of(function, *args):
     try:
         function(*args)
@@ -366,9 +369,8 @@ def work(folder):
         model = gift_model(dtype)
         for count in COUNTS:
             for cut in CUTS:
-                runs = [
-                    step_gradients(model, cut, retain, group(count, dtype), accelerator) for retain in (0, 2, count)
-                ]
+                data = group(count, dtype)
+                runs = {r: step_gradients(model, cut, r, data, accelerator) for r in retained(name, count)}
                 answers[name, count, cut] = runs
         answers[name, "trained"] = train(gift_model(dtype, spread=0), accelerator, dtype)
 
@@ -400,10 +402,11 @@ def test_two_processes_sum_to_the_gradient(two, model_of, count, cut):
     dtype = next(model_of.parameters()).dtype
     name = str(dtype).removeprefix("torch.")
     expected, want = step_gradients(model_of, cut, 0, group(count, dtype))
-    for retain, run0, run1 in zip((0, 2, count), *(answers[name, count, cut] for answers in two), strict=True):
-        (output, got), (other_output, other) = run0, run1
+    runs, other_runs = (answers[name, count, cut] for answers in two)
+    for retain, (output, got) in runs.items():
+        other_output, other = other_runs[retain]
         assert output == other_output and largest_error(got, other) == 0
-        assert largest_error(got, two[0][name, count, cut][0][1]) == 0  # whatever is retained
+        assert largest_error(got, runs[0][1]) == 0  # whatever is retained
         assert largest_error(got, want) < (1e-10 if dtype == torch.float64 else 1e-6 * scale(want))
         assert output[:4] == expected[:4] and output.forwards == 2 * count - num_retained(count, cut, retain)
 

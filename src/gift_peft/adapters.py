@@ -112,13 +112,11 @@ def get_gift_model(model: nn.Module, rank: int = 8, head: str = "full", recipe: 
         raise ValueError(f"target_modules: {targets!r} names no module of this {type(model).__name__}")
     if head == "lora":
         targets = "|".join([f"({_pattern(targets)})", *map(re.escape, _lora_layers(model, saved))])
-    config = LoraConfig(
-        r=rank,
-        target_modules=targets,
-        modules_to_save=saved if head == "full" else None,
-        **recipe.lora,
-    )
+    saved = saved if head == "full" else None
+    config = LoraConfig(r=rank, target_modules=targets, modules_to_save=saved, **recipe.lora)
     check_lora_config(config)
+    if config.lora_dropout:
+        raise ValueError(f"lora_dropout must be 0, got {config.lora_dropout}: a replay must repeat its snapshot")
     for _, module, key in list(dropout_rates(model)):
         setattr(module, key, 0.0)
     with warnings.catch_warnings():  # peft 0.21 reads an attribute that transformers 5.23 deprecates
@@ -128,7 +126,7 @@ def get_gift_model(model: nn.Module, rank: int = 8, head: str = "full", recipe: 
 
 
 def check_lora_config(config: LoraConfig) -> None:
-    """Raise ValueError for options under which `disable_adapter()` or scale 0 is not the base, or replays differ."""
+    """Raise ValueError for options under which `disable_adapter()` or adapter scale 0 is not the base."""
     if config.bias != "none":
         raise ValueError(f"bias={config.bias!r} trains the base's own biases, and the base is the teacher: use 'none'")
     initial = config.init_lora_weights
@@ -139,8 +137,6 @@ def check_lora_config(config: LoraConfig) -> None:
         )
     if config.use_dora:
         raise ValueError("use_dora=True is not supported: its magnitudes do not scale back to the base")
-    if config.lora_dropout:
-        raise ValueError(f"lora_dropout must be 0, got {config.lora_dropout}: a replay must repeat its snapshot")
 
 
 def set_adapter_scale(model: nn.Module, scale: float) -> None:
@@ -152,13 +148,12 @@ def set_adapter_scale(model: nn.Module, scale: float) -> None:
     """
     if not math.isfinite(scale):
         raise ValueError(f"the adapter scale must be finite, got {scale}")
-    layers = list(_lora_parts(model))
-    wrappers = list(_saved_parts(model))
+    layers, wrappers = _lora_parts(model), _saved_parts(model)
     if not layers and not wrappers:
         raise ValueError("the model has no active LoRA adapter to scale")
     if any(layer.merged for layer, _ in layers):
         raise ValueError("the adapter is merged into the base: unmerge it before changing its scale")
-    for config in {id(c): c for c in model.peft_config.values()}.values():
+    for config in getattr(model, "peft_config", {}).values():
         check_lora_config(config)
     trained = [_trained_state(wrapper, name) for wrapper, name in wrappers]  # checks all before changing any
     for layer, name in layers:
@@ -202,20 +197,19 @@ def _between(base: torch.Tensor, trained: torch.Tensor, scale: float) -> torch.T
     return base + scale * (trained - base)
 
 
-def _lora_parts(model: nn.Module) -> Iterator[tuple[LoraLayer, str]]:
+def _active_parts(model: nn.Module, kind: type[nn.Module], weights: str) -> Iterator[tuple[Any, str]]:
+    """(module, adapter name) of the modules of a kind that hold weights of an active adapter."""
     for module in model.modules():
-        if isinstance(module, LoraLayer):
-            for name in module.active_adapters:
-                if name in module.scaling:
-                    yield module, name
+        if isinstance(module, kind):
+            yield from ((module, name) for name in module.active_adapters if name in getattr(module, weights))
 
 
-def _saved_parts(model: nn.Module) -> Iterator[tuple[ModulesToSaveWrapper, str]]:
-    for module in model.modules():
-        if isinstance(module, ModulesToSaveWrapper):
-            for name in module.active_adapters:
-                if name in module.modules_to_save:
-                    yield module, name
+def _lora_parts(model: nn.Module) -> list[tuple[LoraLayer, str]]:
+    return list(_active_parts(model, LoraLayer, "scaling"))
+
+
+def _saved_parts(model: nn.Module) -> list[tuple[ModulesToSaveWrapper, str]]:
+    return list(_active_parts(model, ModulesToSaveWrapper, "modules_to_save"))
 
 
 def _check_base(model: nn.Module) -> None:
@@ -290,7 +284,7 @@ def save_adapter(
     becomes null); `card` the finished README.md. A local base path is warned about: others cannot load
     the adapter by name; it stays out of the card.
     Raises ValueError if an adapter scale other than 1 is set, if `folder` holds other files, and if the card names an
-    absolute base path.
+    absolute base path; NotADirectoryError if `folder` is a file.
     """
     if not isinstance(model, PeftModel) or "default" not in model.peft_config:
         raise ValueError(
@@ -349,11 +343,7 @@ def _hub_name(base: str | None, card: str | None) -> str | None:
 
 
 def _check_replaceable(folder: Path) -> None:
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise ValueError(f"{folder} is not a folder")
-    if others := sorted({path.name for path in folder.iterdir()} - ADAPTER_FILES):
+    if folder.exists() and (others := sorted({path.name for path in folder.iterdir()} - ADAPTER_FILES)):
         raise ValueError(
             f"{folder} holds files that are no adapter's ({', '.join(others[:3])}): choose another folder"
         )

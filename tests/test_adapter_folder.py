@@ -17,7 +17,6 @@ from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
 from gift_peft.adapters import HEADS, get_gift_model, save_adapter, set_adapter_scale
 
-
 LOCAL_BASE = "ignore:the base is the local folder:UserWarning"
 
 

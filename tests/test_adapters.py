@@ -31,7 +31,6 @@ from gift_peft.adapters import (
 )
 from gift_peft.group_step import GroupStep
 
-
 PIXELS = torch.randn(2, 3, 56, 70, generator=torch.Generator().manual_seed(0))
 
 

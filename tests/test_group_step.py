@@ -14,7 +14,6 @@ from gift_peft.adapters import get_gift_model
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import gift_loss
 
-
 SIZE = (28, 28)
 COUNTS, CUTS = (2, 3, 5, 9), (1, 2, 4)
 DTYPES = {"float64": torch.float64, "float32": torch.float32}

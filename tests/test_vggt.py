@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel, pipeline
 from transformers.modeling_outputs import DepthEstimatorOutput
 
-from gift_peft.adapters import GiftRecipe, get_gift_model, save_adapter
+from gift_peft.adapters import get_gift_model, save_adapter
 from gift_peft.data.preprocess import to_pixel_values
 from gift_peft.group_step import GroupStep
 from gift_peft.models import register_models
@@ -28,12 +28,6 @@ from gift_peft.models.vggt.modeling_vggt import rotary_angles, rotate
 FIXTURES = Path(__file__).parent / "fixtures" / "vggt"
 SIDECAR = json.loads((FIXTURES / "golden_public.json").read_text())
 SHAPES = Path(__file__).parents[2] / "shared/reference/vggt/vggt1b_state_dict_shapes.json"
-RECIPE = GiftRecipe(
-    target_modules=r"aggregator\.(patch_embed\.blocks|frame_blocks|global_blocks)\.\d+\.attn\.(qkv|proj)",
-    modules_to_save=["depth_head"],
-    kind="depth",
-    size=(476, 644),
-)
 
 
 def tiny_config(**changes) -> VggtConfig:
@@ -546,7 +540,7 @@ def test_gift_trains_an_adapter(tmp_path, head):
     pixels = images(3, 3, 28, 42)
     with torch.no_grad():
         teacher = base(pixels).predicted_depth
-    model = get_gift_model(base, head=head, recipe=RECIPE)
+    model = get_gift_model(base, head=head)
     adapted = {name.split(".lora_A")[0] for name, _ in model.named_parameters() if ".lora_A" in name}
     assert sum(".attn." in name for name in adapted) == 2 * (2 + 2 * 4)
     mask = torch.zeros(3, 28, 42, dtype=torch.bool)

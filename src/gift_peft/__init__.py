@@ -1,12 +1,13 @@
 """Geometry-invariant fine-tuning (GIFT): depth models learn to see mirrors and glass, without depth labels.
 
-Importing the package makes `datasets.load_dataset("gift_i", data_dir=...)` work. The names below are imported when
-they are first used, so that `gift-peft --help` does not wait for torch.
+Importing the package makes `datasets.load_dataset("gift_i", data_dir=...)` work and transformers' Auto classes know
+VGGT and Metric3D V2. The names below are imported when first used, so that `gift-peft --help` does not wait for torch.
 """
 
 from importlib import import_module
 
 from gift_peft.data.gift_i import register
+from gift_peft.models import register_models
 
 __version__ = "0.1.0"
 
@@ -15,8 +16,12 @@ _HOME = {
     "GiftI": "data.gift_i",
     "GiftRecipe": "adapters",
     "GroupStep": "group_step",
+    "Metric3DConfig": "models.metric3d",
+    "Metric3DForDepthEstimation": "models.metric3d",
     "PROTOCOLS": "evaluation.protocols",
     "RECIPES": "adapters",
+    "VggtConfig": "models.vggt",
+    "VggtForDepthEstimation": "models.vggt",
     "align": "evaluation.alignment",
     "depth_metrics": "evaluation.metrics",
     "evaluate_gift_i": "evaluation.evaluate",
@@ -47,3 +52,4 @@ def __dir__() -> list[str]:
 
 
 register()
+register_models()

@@ -71,6 +71,12 @@ RECIPES: dict[str, GiftRecipe] = {
         modules_to_save=["neck", "head"],
         size=(476, 644),
     ),
+    "gift_vggt": GiftRecipe(
+        target_modules=r"aggregator\.(patch_embed\.blocks|frame_blocks|global_blocks)\.\d+\.attn\.(qkv|proj)",
+        modules_to_save=["depth_head"],
+        kind="depth",
+        size=(476, 644),
+    ),
 }
 
 
@@ -307,7 +313,8 @@ def save_adapter(
         config.update(base_model_name_or_path=base, revision=revision)
         _write_json(temporary / ADAPTER_CONFIG, config)
         if processor is not None:
-            _at_size(processor, size).save_pretrained(temporary)
+            # Not save_pretrained: it would put the code of VGGT's and Metric3D's processors beside the adapter.
+            _at_size(processor, size).to_json_file(temporary / "preprocessor_config.json")
         _write_json(temporary / "gift.json", _gift_json(gift, size))
         # Last: PEFT writes a README of its own, which names a local base path.
         (temporary / "README.md").write_text(card or _minimal_card(hub_base), encoding="utf-8")

@@ -207,6 +207,17 @@ assert type(AutoConfig.for_model("gift_vggt")).__name__ == "VggtConfig"
 """
 
 
+OURS_FIRST = """
+from gift_peft.models import register_models
+register_models()
+from gift_peft.models.vggt import VggtConfig  # halfway through this, transformers is imported and wants them all
+from transformers import AutoConfig
+assert type(AutoConfig.for_model("gift_vggt")) is VggtConfig
+assert type(AutoConfig.for_model("gift_metric3d")).__name__ == "Metric3DConfig"
+"""
+
+
 @pytest.mark.slow
-def test_registration_waits_for_transformers():
-    subprocess.run([sys.executable, "-c", LAZY], check=True)
+@pytest.mark.parametrize("code", [LAZY, OURS_FIRST])
+def test_registration_waits_for_transformers(code):
+    subprocess.run([sys.executable, "-c", code], check=True)

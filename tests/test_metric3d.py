@@ -60,7 +60,7 @@ def randomize(model, seed=0):
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for name, value in model.named_parameters():
-            scale = 1 / value[0].numel() ** 0.5 if value.ndim > 1 else 0.1
+            scale = 1.4 / value[0].numel() ** 0.5 if value.ndim > 1 else 0.1
             value.copy_(torch.randn(value.shape, generator=generator) * scale)
             if "gamma" in name or ("norm" in name and name.endswith("weight") and value.ndim == 1):
                 value.add_(1)
@@ -269,7 +269,7 @@ def test_images_of_a_batch_do_not_meet():
             alone = model(pixels[index : index + 1])
             close(alone.predicted_depth[0], together.predicted_depth[index], DEPTH)
             close(alone.normals[0], together.normals[index], NORMAL)
-    assert together.predicted_depth.std() > 1  # the comparison means something
+    assert together.predicted_depth.std(dim=0).mean() > 0.5  # metres: the images do differ
 
 
 def test_depth_stays_in_its_range():

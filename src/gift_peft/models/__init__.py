@@ -4,7 +4,8 @@
 it is: torch takes longer to import than the command line takes to answer --help.
 """
 
-import importlib.machinery
+import importlib
+import importlib.util
 import sys
 
 HOST = "transformers"
@@ -28,7 +29,7 @@ class _AfterImport:
         if name != HOST:
             return None
         sys.meta_path.remove(self)
-        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        spec = importlib.util.find_spec(name)
         if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
 
@@ -41,18 +42,21 @@ class _AfterImport:
 
 
 def _register() -> None:
+    # Each registers itself: it may be halfway through its own import, if that is what imports transformers.
+    for name in ("vggt", "metric3d"):
+        importlib.import_module(f"{__name__}.{name}")
+
+
+def register_classes(config, model, image_processor) -> None:
+    """Make the Auto classes and pipelines know an architecture, and `save_pretrained` write its code too."""
     from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation
     from transformers.models.auto.video_processing_auto import AutoVideoProcessor  # the top level asks for torchvision
 
-    from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
-    from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil
-
-    for config, model, processor in (
-        (VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil),
-        (Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil),
-    ):
-        AutoConfig.register(config.model_type, config, exist_ok=True)
-        AutoModelForDepthEstimation.register(config, model, exist_ok=True)
-        AutoImageProcessor.register(config, image_processor_classes={"pil": processor}, exist_ok=True)
-        # Pipelines take any remote image processor for a video processor too and would ask before running its code.
-        AutoVideoProcessor.register(config, video_processor_classes={}, exist_ok=True)
+    AutoConfig.register(config.model_type, config, exist_ok=True)
+    AutoModelForDepthEstimation.register(config, model, exist_ok=True)
+    AutoImageProcessor.register(config, image_processor_classes={"pil": image_processor}, exist_ok=True)
+    # Pipelines take any remote image processor for a video processor too and would ask before running its code.
+    AutoVideoProcessor.register(config, video_processor_classes={}, exist_ok=True)
+    config.register_for_auto_class()
+    model.register_for_auto_class("AutoModelForDepthEstimation")
+    image_processor.register_for_auto_class("AutoImageProcessor")

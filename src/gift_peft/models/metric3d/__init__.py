@@ -3,12 +3,12 @@
 Saved folders carry these files, so that they also load with `trust_remote_code=True` where gift-peft is not installed.
 """
 
+from gift_peft.models import register_classes
+
 from .configuration_metric3d import Metric3DConfig
 from .image_processing_metric3d import Metric3DImageProcessorPil
 from .modeling_metric3d import Metric3DForDepthEstimation
 
 __all__ = ["Metric3DConfig", "Metric3DForDepthEstimation", "Metric3DImageProcessorPil"]
 
-Metric3DConfig.register_for_auto_class()
-Metric3DForDepthEstimation.register_for_auto_class("AutoModelForDepthEstimation")
-Metric3DImageProcessorPil.register_for_auto_class("AutoImageProcessor")
+register_classes(Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil)

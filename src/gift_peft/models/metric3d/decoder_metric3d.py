@@ -1,8 +1,9 @@
 """Decoder of Metric3D V2: tokens become feature maps, a DPT makes a first depth and normal, convolutional GRUs at
 three scales refine both (RAFT-Stereo's recurrence), and a learned convex combination enlarges them four times.
 
-The state of the recurrence (`flow`) has six channels at 1/4 of the image: depth as (metres - depth_max) / regress_scale, depth
-confidence, the normal's x, y, z, and its concentration kappa. It stays in full precision under autocast.
+The state of the recurrence (`flow`) has six channels at 1/4 of the image: depth as (metres - depth_max) /
+regress_scale, depth confidence, the normal's x, y, z, and its concentration kappa. It stays in full precision under
+autocast.
 """
 
 import math

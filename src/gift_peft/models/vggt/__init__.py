@@ -3,12 +3,12 @@
 Saved folders carry these files, so that they also load with `trust_remote_code=True` where gift-peft is not installed.
 """
 
+from gift_peft.models import register_classes
+
 from .configuration_vggt import VggtConfig
 from .image_processing_vggt import VggtImageProcessorPil
 from .modeling_vggt import VggtForDepthEstimation
 
 __all__ = ["VggtConfig", "VggtForDepthEstimation", "VggtImageProcessorPil"]
 
-VggtConfig.register_for_auto_class()
-VggtForDepthEstimation.register_for_auto_class("AutoModelForDepthEstimation")
-VggtImageProcessorPil.register_for_auto_class("AutoImageProcessor")
+register_classes(VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil)

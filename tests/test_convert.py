@@ -194,10 +194,11 @@ def test_the_folder_works_without_this_package(case, tmp_path, monkeypatch):
 
 
 LAZY = """
-import sys
+import importlib.util, sys
 from gift_peft.models import register_models
 register_models()
 register_models()
+assert importlib.util.find_spec("transformers") is not None  # a look is no import
 assert "torch" not in sys.modules and "transformers" not in sys.modules
 import transformers.models.dinov2.modeling_dinov2  # a submodule first: its parent registers
 from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation

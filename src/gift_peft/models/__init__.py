@@ -25,16 +25,23 @@ def register_models() -> None:
 class _AfterImport:
     """An import finder that finds transformers where it is, and registers the models once it has been executed."""
 
+    searching = False
+
     def find_spec(self, name, path=None, target=None):
-        if name != HOST:
+        if name != HOST or self.searching:
             return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(name)
+        self.searching = True  # so that the other finders are asked
+        try:
+            spec = importlib.util.find_spec(name)
+        finally:
+            self.searching = False
         if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
 
             def exec_module(module):
                 execute(module)
+                # Not before: many packages look for transformers without importing it.
+                sys.meta_path.remove(self)
                 _register()
 
             spec.loader.exec_module = exec_module

@@ -1,8 +1,8 @@
 """Pre-train the embedded base model from scratch on the opaque renders: two million weights, inverse depth in 1/m.
 
     python examples/embedded/pretrain_base.py --out renders/first --scenes 2004 --steps 4500
-    python examples/embedded/pretrain_base.py --out renders/model --init renders/first/base --steps 2000 \\
-        --learning_rate 6e-4
+    python examples/embedded/pretrain_base.py --out renders/model --init renders/first/base --steps 900 \\
+        --learning_rate 5e-4
 
 Weighted L1 and a multi-scale gradient loss on inverse depth, AdamW with a one-cycle schedule, flips and colour jitter,
 an exponential average of the weights, bf16 autocast. The first `--held_out` scenes are never trained on; every 500

@@ -112,6 +112,30 @@ def plan(rng, kind: str):
     return scene, target
 
 
+def decoys(rng, scene, target) -> None:
+    """Opaque twins of the targets elsewhere in the room, as real rooms have boards, pictures, bottles and balls.
+
+    They lie outside the mask: without them nothing would keep an adapted model from pushing every panel away.
+    """
+    kinds = rng.permutation(["wall", "standing", "table", "standing", "table"])[: rng.integers(3, 5)]
+    for kind in kinds:
+        if kind == "table":
+            twin = targets.table_object(rng, scene)
+            if twin is None or rooms.between(*twin.base[:2], 0.45, *target.centre[:2]):
+                continue
+            gloss = float(rng.uniform(0.04, 0.3)) if rng.random() < 0.6 else None
+            scene.items += [*twin.holder, twin.body(twin_look(rng), gloss, role="")]
+            continue
+        twin = targets.wall_panel(rng, scene) if kind == "wall" else targets.standing_panel(rng, scene, True)
+        apart = 0.0 if twin is None else np.linalg.norm(twin.centre - target.centre)
+        if apart > 0.9 and not rooms.between(*twin.centre[:2], np.linalg.norm(twin.u), *target.centre[:2]):
+            scene.items += [*twin.holder, twin.panel(twin_look(rng), role="")]
+
+
+def twin_look(rng) -> np.ndarray:
+    return [targets.treated, printed, printed][rng.integers(3)](rng)
+
+
 def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
     """One observation: linear radiance (H, W, 3) and z-depth (H, W) in metres."""
     import tracer
@@ -131,8 +155,8 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
         radiance = lit(direct, albedo)
         if open_part.max() > 0:
             seen = lit(*tracer.reflection(scene, [*items, *moved], target.centre, target.normal))
-            dust = rng.uniform(0.0, 0.04) * smudges(rng, scene, target)[..., None] * radiance.mean()
-            tint = rng.uniform(0.82, 0.93) * np.array([0.98, 1.0, 0.98])
+            dust = rng.uniform(0.02, 0.08) * smudges(rng, scene, target)[..., None] * radiance.mean()
+            tint = rng.uniform(0.76, 0.88) * np.array([0.96, 1.0, 0.99])
             radiance = radiance + open_part[..., None] * (tint * seen + dust)
         return radiance, tracer.z_depth(scene, [*items, black])
 
@@ -145,9 +169,9 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
         carried = clutter(rng, rng.integers(0, 3), (left + 0.4, right - 0.4), (rear + 0.3, -0.1))
         mirrored = lit(*tracer.reflection(scene, [*items, *carried], target.centre, target.normal))
         share = (alpha * fresnel(scene, target))[..., None]
-        tint = 1 - alpha[..., None] * (1 - rng.uniform(0.86, 0.95) * np.array([0.96, 1.0, 0.975]))
+        tint = 1 - alpha[..., None] * (1 - rng.uniform(0.78, 0.9) * np.array([0.93, 1.0, 0.96]))
         through = lit(direct, albedo)
-        dust = alpha * rng.uniform(0.02, 0.07) * smudges(rng, scene, target) * through.mean()
+        dust = alpha * rng.uniform(0.06, 0.16) * smudges(rng, scene, target) * through.mean()
         radiance = through * tint * (1 - share) + share * mirrored + dust[..., None]
         return radiance, tracer.z_depth(scene, [*items, *moved, target.panel(textures.paint(rng))])
 
@@ -190,6 +214,12 @@ def make_group(seed: int, kind: str):
     if planned is None:
         return None
     scene, target = planned
+    if kind != "solid" and len(target.holder) < 5:
+        target.holder += (
+            frame := targets.border(rng, target.centre, target.u, target.v, rng.uniform(0.03, 0.08), 0.05)
+        )
+        scene.items += frame
+    decoys(rng, scene, target)
     matte = target.body(targets.treated(rng)) if kind == "solid" else target.panel(targets.treated(rng))
     if kind == "mirror":  # the virtual camera must stay inside the room, or a wall would stand before it
         virtual = tracer.mirrored_camera(scene.camera, target.centre, target.normal).origin

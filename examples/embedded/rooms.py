@@ -205,14 +205,14 @@ def free_spot(rng, scene: Scene, radius, x_range, y_range, keep_clear=()) -> tup
             continue
         if any((x - a) ** 2 + (y - b) ** 2 < (radius + r) ** 2 for a, b, r in scene.taken):
             continue
-        if any(_between(x, y, radius, px, py) for px, py in keep_clear):
+        if any(between(x, y, radius, px, py) for px, py in keep_clear):
             continue
         scene.taken.append((x, y, radius))
         return x, y
     return None
 
 
-def _between(x, y, radius, px, py) -> bool:
+def between(x, y, radius, px, py) -> bool:
     """Does a disc at (x, y) cover the line of sight from the camera to (px, py)?"""
     length = np.hypot(px, py)
     along = (x * px + y * py) / length

@@ -25,8 +25,8 @@ class Flat:
         n = np.cross(self.u, self.v)
         return n / np.linalg.norm(n)
 
-    def panel(self, texture: np.ndarray, gloss: float | None = None) -> Item:
-        return quad(self.centre, self.u, self.v, texture, gloss=gloss, role="target")
+    def panel(self, texture: np.ndarray, gloss: float | None = None, role: str = "target") -> Item:
+        return quad(self.centre, self.u, self.v, texture, gloss=gloss, role=role)
 
 
 @dataclass
@@ -42,8 +42,8 @@ class Solid:
     def centre(self) -> np.ndarray:
         return self.base + np.array([0, 0, self.outline[:, 1].max() / 2])
 
-    def body(self, texture: np.ndarray, gloss: float | None = None) -> Item:
-        return rooms.turned(self.base, self.outline, texture, gloss=gloss, role="target")
+    def body(self, texture: np.ndarray, gloss: float | None = None, role: str = "target") -> Item:
+        return rooms.turned(self.base, self.outline, texture, gloss=gloss, role=role)
 
     def cavity(self) -> Item:
         top = self.outline[:, 1].max()

@@ -77,6 +77,12 @@ RECIPES: dict[str, GiftRecipe] = {
         kind="depth",
         size=(476, 644),
     ),
+    "gift_metric3d": GiftRecipe(
+        target_modules=r"depth_model\.encoder\.blocks\.0\.\d+\.attn\.(qkv|proj)",
+        modules_to_save=["depth_model.decoder"],
+        kind="depth",
+        size=(476, 644),
+    ),
 }
 
 

@@ -78,6 +78,15 @@ def _parser() -> argparse.ArgumentParser:
     _add_model(predict)
     _add_adapter(predict)
     predict.add_argument("--out", required=True, help="folder for the npy and png files")
+    convert = verb("convert", _convert, "official VGGT or Metric3D V2 weights to a transformers folder")
+    convert.add_argument("architecture", choices=["vggt", "metric3d"])
+    convert.add_argument(
+        "source",
+        metavar="SRC",
+        help="official .safetensors, .pt or .pth file, or hub id (owner/repo or owner/repo/file)",
+    )
+    convert.add_argument("folder", metavar="DST", help="new folder")
+    convert.add_argument("--config", metavar="FILE", help="JSON of other sizes than the released ones")
     return parser
 
 
@@ -168,6 +177,14 @@ def _predict(args: argparse.Namespace, rest: list[str]) -> int:
         revision=args.revision,
     )
     print(f"Written: {len(files)} depth maps in {args.out}")
+    return 0
+
+
+def _convert(args: argparse.Namespace, rest: list[str]) -> int:
+    from gift_peft.models.convert import CONVERTERS
+
+    folder = CONVERTERS[args.architecture](args.source, args.folder, args.config)
+    print(f"Model: {folder}")
     return 0
 
 

@@ -9,7 +9,7 @@ REQUIRED = ["--model_name_or_path", "m", "--dataset_name", "d", "--output_dir", 
 
 
 def write(path, text):
-    path.write_text(text)
+    path.write_bytes(text.encode(errors="surrogateescape"))
     return ["--config", str(path)]
 
 
@@ -54,6 +54,8 @@ def test_config_yaml_of_a_run_reads_back(tmp_path):
         ("lambda_c: {a: 1}\n", "lambda_c: expected a value"),
         ("- 1\n", "expected lines of the form"),
         ("a: b: c\n", "not valid YAML"),
+        ("license: \udcff\n", "not valid YAML"),
+        ("lora_rank: [4, 8]\n", "lora_rank: expected one value, not a list"),
     ],
 )
 def test_yaml_errors_name_file_and_key(tmp_path, text, message):
@@ -90,14 +92,29 @@ def test_unknown_and_missing_arguments():
         ("max_steps", 0),
         ("learning_rate", 0.0),
         ("learning_rate", float("nan")),
+        ("learning_rate", float("inf")),
+        ("adam_beta1", 1.0),
+        ("adam_beta2", -0.1),
+        ("adam_epsilon", 0.0),
+        ("group_cache_gb", float("inf")),
+        ("lambda_c", float("inf")),
         ("lambda_d", -1.0),
         ("lambda_d", float("nan")),
         ("seed", -1),
+        ("seed", 2**32),
+        ("checkpoint_at_steps", [3, 0]),
+        ("prediction_kind", "depth"),
+        ("modules_to_save", ["head"]),
     ],
 )
 def test_values_out_of_range_are_named(name, value):
     with pytest.raises(ValueError, match=name):
         GiftTrainingArguments("m", "d", "o", **{name: value})
+
+
+def test_a_broken_expression_is_named():
+    with pytest.raises(ValueError, match="target_modules: not a regular expression"):
+        GiftTrainingArguments("m", "d", "o", target_modules="(", modules_to_save=["head"])
 
 
 def test_resuming_and_overwriting_exclude_each_other():

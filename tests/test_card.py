@@ -54,6 +54,9 @@ def test_a_licence_may_be_stated(tmp_path):
     assert card.base_license("someone/unknown") == "other"
     (tmp_path / "README.md").write_text("---\nlicense: bsd-2-clause\n---\n")
     assert card.base_license(str(tmp_path)) == "bsd-2-clause"
+    for broken in (b"---\nlicense: [a\n: b\n---\n", b"---\nlicense: \xff\n---\n"):
+        (tmp_path / "README.md").write_bytes(broken)
+        assert card.base_license(str(tmp_path)) == "other"
 
 
 def test_without_validation_nothing_is_claimed(tmp_path):
@@ -147,6 +150,9 @@ def test_push_is_checked_before_anything_is_loaded(base_dir, tree, tmp_path, mon
         train(GiftTrainingArguments("some/base", str(tree), str(tmp_path / "out"), push_to_hub=True))
     with pytest.raises(ValueError, match="push_to_hub: model_name_or_path is a local folder"):
         train(arguments(base_dir, tree, tmp_path / "out", push_to_hub=True))
+    monkeypatch.setattr(huggingface_hub, "get_token", lambda: "token")
+    with pytest.raises(ValueError, match=r"push_to_hub: .*'a/b/c'.*hub_model_id"):
+        train(GiftTrainingArguments("some/base", "d", str(tmp_path / "out"), push_to_hub=True, hub_model_id="a/b/c"))
     assert not (tmp_path / "out").exists()
 
 

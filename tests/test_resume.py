@@ -13,6 +13,8 @@ from runs import arguments, assert_same_run, run_in_child, train_again, weights
 from tiny import write_raw_tree
 
 from gift_peft import cli
+from gift_peft.data.gift_i import dataset_fingerprint, load_gift_i
+from gift_peft.data.writer import write_gift_i
 from gift_peft.group_step import GroupStep
 from gift_peft.training import checkpoints, loop, train
 
@@ -161,6 +163,19 @@ def test_a_broken_newest_checkpoint_is_skipped(args, whole, tmp_path, capsys):
     assert_same_run(tmp_path / "out", whole)
 
 
+def test_the_only_good_checkpoint_is_not_pushed_out_by_a_broken_later_one(args, whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "out")
+    (tmp_path / "out/checkpoint-4" / checkpoints.RNG).unlink()
+    checkpoints.prune_checkpoints(tmp_path / "out", 3, 1, [])
+    assert [folder.name for folder in checkpoints.list_checkpoints(tmp_path / "out")] == [
+        "checkpoint-3",
+        "checkpoint-4",
+    ]
+    train_again(args, checkpoints_total_limit=1)
+    assert_same_run(tmp_path / "out", whole)
+    assert [folder.name for folder in checkpoints.list_checkpoints(tmp_path / "out")] == ["checkpoint-4"]
+
+
 def test_only_broken_checkpoints_are_an_error(args, tmp_path):
     (tmp_path / "out/checkpoint-2").mkdir(parents=True)
     with pytest.raises(ValueError, match=r"no complete checkpoint in .*out"):
@@ -202,6 +217,21 @@ def test_a_changed_dataset_is_refused(args, whole, tree, tmp_path):
     shutil.copy(tmp_path / "raw/train/scene_1/masks/0.png", mask)
     with pytest.raises(ValueError, match="resume_from_checkpoint: dataset_name: its images, masks or groups"):
         train_again(args, dataset_name=str(tmp_path / "raw"))
+
+
+def test_another_order_of_the_groups_is_refused(args, whole, tree, tmp_path):
+    """The same content, so the same fingerprint, but other updates."""
+    groups = []
+    for split in ("validation", "train"):
+        rows = load_gift_i(tree, split)
+        for index in reversed(range(len(rows))):
+            keys = ("group_id", "image_names", "images", "masks", "reference")
+            groups.append({"split": split, **{key: rows[index][key] for key in keys}})
+    folder = write_gift_i(groups, tmp_path / "prepared", license="cc0-1.0")
+    assert dataset_fingerprint(load_gift_i(folder, "train")) == dataset_fingerprint(load_gift_i(tree, "train"))
+    shutil.copytree(whole, tmp_path / "out")
+    with pytest.raises(ValueError, match="resume_from_checkpoint: group_order: the order of the training groups has"):
+        train_again(args, dataset_name=str(folder), proxies_dir=str(tree / "proxies"))
 
 
 def test_a_moved_dataset_is_not_a_changed_one(args, whole, tree, tmp_path):
@@ -258,3 +288,20 @@ def test_leftovers_give_a_replaced_folder_its_name_back(tmp_path):
         "checkpoint-2": ".checkpoint-2.old",
         "checkpoint-3": "checkpoint-3",
     }
+
+
+def test_leftovers_are_a_runs_own(tmp_path):
+    for name in (".env.old", ".cache.tmp", ".metrics.jsonl.bak", ".adapter-mine.tmp"):
+        (tmp_path / name).mkdir()
+    for name in (".metrics.jsonl.123", ".config.yaml.9"):
+        (tmp_path / name).write_text("half")
+    for name in ("..checkpoint-3.tmp.tmp", "..checkpoint-3.tmp.old", ".adapter.tmp", ".adapter-last.old"):
+        (tmp_path / name).mkdir()
+    checkpoints.remove_leftovers(tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {".env.old", ".cache.tmp", ".metrics.jsonl.bak", ".adapter-mine.tmp", "adapter-last"}
+
+
+def test_the_command_to_go_on_survives_a_space(tmp_path):
+    text = loop._how_to_resume(tmp_path / "my run", 3)
+    assert f"--config '{tmp_path}/my run/config.yaml' --resume" in text

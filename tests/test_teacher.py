@@ -384,6 +384,40 @@ def test_wrong_bases_and_sizes(raw_tree, base_dir, tmp_path):
         make_proxies(only_model, raw_tree, size=SIZE)
     with pytest.raises(ValueError, match="multiples of the patch size 14"):
         make_proxies(base_dir, raw_tree, size=(50, 70))
+    cut = copy_base(base_dir, tmp_path / "cut")
+    (cut / "model.safetensors").write_bytes((base_dir / "model.safetensors").read_bytes()[:2000])
+    other = copy_base(base_dir, tmp_path / "other")
+    config = json.loads((other / "config.json").read_text())
+    (other / "config.json").write_text(json.dumps({**config, "head_hidden_size": 16}))
+    for base in (cut, other):
+        with pytest.raises(ValueError) as excinfo:
+            make_proxies(base, raw_tree, size=SIZE)
+        one_line(excinfo, f"base model {base}: ")
+
+
+def test_the_processor_that_accelerate_was_told_is_used(raw_tree, base_dir, monkeypatch):
+    asked = []
+    state = PartialState()
+    monkeypatch.setattr(teacher, "PartialState", lambda cpu: asked.append(cpu) or state)
+    for value in ("true", "false"):
+        monkeypatch.setenv("ACCELERATE_USE_CPU", value)
+        make_proxies(base_dir, raw_tree, size=SIZE)
+    assert asked == [True, False]
+
+
+def test_a_folder_that_cannot_be_written_is_told_like_any_error(raw_tree, base_dir, monkeypatch):
+    """In all processes: see the two processes above for `_raise_everywhere`."""
+    told = []
+    raise_everywhere = teacher._raise_everywhere
+    monkeypatch.setattr(teacher, "_raise_everywhere", lambda *args: told.append(args[0]) or raise_everywhere(*args))
+
+    def refuse(path, *args):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(teacher, "write_proxies", refuse)
+    with pytest.raises(PermissionError, match=r"scene_0\.safetensors") as excinfo:
+        make_proxies(base_dir, raw_tree, size=SIZE)
+    assert told == [excinfo.value]
 
 
 def test_where_proxies_are_kept(tmp_path, monkeypatch):

@@ -209,6 +209,55 @@ def test_nan_stops_with_the_groups_name_and_leaves_the_last_checkpoint(base_dir,
     assert train_again(args).step == 6
 
 
+@pytest.mark.parametrize("error", ["weights", "memory"])
+def test_bad_weights_and_too_little_memory_name_step_and_group(error, base_dir, tree, tmp_path, monkeypatch):
+    def fail(optimizer, *args, **kwargs):
+        if error == "memory":
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")
+        optimizer.param_groups[0]["params"][-1].data.view(-1)[0] = float("inf")
+
+    monkeypatch.setattr(torch.optim.Adam, "step", fail)
+    message = {"weights": "the update made weights NaN or infinite", "memory": "CUDA out of memory"}[error]
+    with pytest.raises(ValueError, match=rf"step 1, group scene_\d: {message}.*no checkpoint"):
+        train(arguments(base_dir, tree, tmp_path / "out"))
+    assert not list((tmp_path / "out").glob("adapter*"))
+
+
+def test_a_loss_that_overflows_is_an_error():
+    """The gradient of an L1 is a sign: it stays finite."""
+    model = torch.nn.Conv2d(3, 1, 1, bias=False)
+    torch.nn.init.constant_(model.weight, 3e38)
+    step = loop.GroupStep(one_conv(model))
+    pixels = torch.zeros(2, 3, 4, 4)
+    pixels[0, 0], pixels[1, 0] = 1, -1
+    with pytest.raises(ValueError, match="loss of this group is NaN or infinite"):
+        step.accumulate(pixels, torch.ones(2, 4, 4, dtype=torch.bool), torch.zeros(2, 4, 4))
+    assert model.weight.grad is None
+
+
+def one_conv(conv):
+    """(B,3,h,w) as `pixel_values` to (B,h,w)."""
+
+    class Model(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.conv = conv
+
+        def forward(self, pixel_values):
+            return self.conv(pixel_values)[:, 0]
+
+    return Model()
+
+
+def test_validation_groups_that_choose_nothing_are_told(base_dir, tree, tmp_path, capsys):
+    shutil.copytree(tree / "train", tmp_path / "raw/train")
+    write_group(tmp_path / "raw/validation/alone", 1, 7, reference=True)
+    result = train(arguments(base_dir, tmp_path / "raw", tmp_path / "out", max_steps=1))
+    assert (result.best_step, result.metrics[-1]["val_gce"]) == (None, None)
+    assert result.metrics[-1]["val_tom_rmse"] is not None
+    assert "it is the last adapter, chosen by nothing" in capsys.readouterr().out
+
+
 def test_a_diverging_run_names_the_group(base_dir, tree, tmp_path):
     with pytest.raises(ValueError, match=r"group scene_\d"):
         train(arguments(base_dir, tree, tmp_path / "out", learning_rate=1e30))
@@ -219,8 +268,9 @@ def test_missing_proxies_and_a_folder_that_cannot_be_written(base_dir, tree, tmp
         raise PermissionError(13, "Permission denied", "/read/only/proxies")
 
     monkeypatch.setattr(loop, "make_proxies", refuse)
-    with pytest.raises(PermissionError, match=r"/read/only/proxies.*gift-peft proxies --base"):
-        train(arguments(base_dir, tree, tmp_path / "out"))
+    command = r"gift-peft proxies --base .* --size 56x70 --revision v2"
+    with pytest.raises(PermissionError, match=rf"/read/only/proxies.*{command}"):
+        train(arguments(base_dir, tree, tmp_path / "out", model_revision="v2"))
 
 
 def test_a_dataset_without_train_groups(base_dir, tmp_path):
@@ -234,8 +284,6 @@ def test_a_model_without_a_recipe_is_told_how_to_spell_one(base_dir, tree, tmp_p
     monkeypatch.setattr("gift_peft.adapters.RECIPES", {})
     with pytest.raises(ValueError, match=r"model_name_or_path: no recipe .*target_modules, modules_to_save and pred"):
         train(arguments(base_dir, tree, tmp_path / "out"))
-    with pytest.raises(ValueError, match="target_modules and modules_to_save: give both"):
-        train(arguments(base_dir, tree, tmp_path / "out", target_modules="x"))
 
 
 def test_a_disk_that_is_full_names_the_checkpoint(base_dir, tree, tmp_path, monkeypatch):

@@ -84,7 +84,7 @@ class GroupStep:
         Args: `pixel_values` (N,3,h,w) on any device, `mask` (N,H,W) bool, `target` (N,H,W) proxies in native units,
         `valid` (N,H,W) bool or None, with (H,W) the size of the prediction; `names` of the images, for messages.
         Raises ValueError, on all processes and with `.grad` as it was, for inconsistent shapes, non-finite
-        predictions, proxies or gradients, and a model that is not replayable (dropout, BatchNorm in training).
+        predictions, proxies, loss or gradients, and a model that is not replayable (dropout, BatchNorm in training).
         """
         _check_replayable(self.model)
         parameters = [p for p in self.model.parameters() if p.requires_grad]
@@ -103,6 +103,8 @@ class GroupStep:
         graphs = self._snapshot(pixel_values, batches, canvas, first_retained=len(mask) - num_retained)
         require_finite(canvas, "the prediction", names)
         loss, gradient = self._differentiate(canvas, target, mask, valid)
+        if not loss.total.isfinite():  # differences of finite predictions overflow; their signs do not
+            raise ValueError("the loss of this group is NaN or infinite")
         self._add_gradients(parameters, lambda: self._replay(pixel_values, batches, gradient, graphs))
         return GroupStepOutput(*loss, forwards=2 * len(mask) - num_retained)
 

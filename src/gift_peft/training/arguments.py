@@ -6,9 +6,11 @@ names those of the Hugging Face examples.
 
 import argparse
 import difflib
+import math
+import re
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_origin
 
 import yaml
 
@@ -120,16 +122,36 @@ class GiftTrainingArguments:
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ValueError(f"{name}: must be at least 1, got {value}")
         for name in ("lambda_c", "lambda_d", "weight_decay", "dataloader_num_workers", "group_cache_gb", "seed"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: must not be negative, got {getattr(self, name)}")
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: must be finite and not negative, got {getattr(self, name)}")
         if self.retain != "auto" and self.retain < 0:
             raise ValueError(f"retain: must not be negative, got {self.retain}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate: must be positive, got {self.learning_rate}")
+        for name in ("learning_rate", "adam_epsilon"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: must be positive and finite, got {getattr(self, name)}")
+        for name in ("adam_beta1", "adam_beta2"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name}: must be at least 0 and below 1, got {getattr(self, name)}")
+        if self.seed >= 2**32:
+            raise ValueError(f"seed: must be below 2**32, got {self.seed}")
+        if any(step < 1 for step in self.checkpoint_at_steps):
+            raise ValueError(f"checkpoint_at_steps: must be at least 1, got {min(self.checkpoint_at_steps)}")
+        self._check_recipe()
         if self.max_steps < 1 and self.max_steps != -1:
             raise ValueError(f"max_steps: must be at least 1, or -1, got {self.max_steps}")
         if self.overwrite_output_dir and self.resume_from_checkpoint:
             raise ValueError("overwrite_output_dir and resume_from_checkpoint exclude each other")
+
+    def _check_recipe(self) -> None:
+        """The three arguments that spell a recipe out."""
+        if bool(self.target_modules) != bool(self.modules_to_save):
+            raise ValueError("target_modules and modules_to_save: give both or neither")
+        if self.prediction_kind and not self.target_modules:
+            raise ValueError("prediction_kind: the recipe says it; only with target_modules and modules_to_save")
+        try:
+            re.compile(self.target_modules or "")
+        except re.error as error:
+            raise ValueError(f"target_modules: not a regular expression: {error}") from None
 
     def to_yaml(self) -> str:
         """All values as `--config` reads them, without what is None or empty and without the two about resuming."""
@@ -174,7 +196,7 @@ def _yaml_to_argv(path: Path) -> list[str]:
         raise FileNotFoundError(f"config: no such file: {path}")
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"config {path}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(values, dict):
         raise ValueError(f"config {path}: expected lines of the form `key: value`")
@@ -185,6 +207,8 @@ def _yaml_to_argv(path: Path) -> list[str]:
             raise ValueError(f"config {path}: unknown key {key!r}{_nearest(str(key))}")
         if isinstance(value, dict):
             raise ValueError(f"config {path}: {key}: expected a value, not a mapping")
+        if isinstance(value, list) and get_origin(types[key]) is not list:
+            raise ValueError(f"config {path}: {key}: expected one value, not a list")
         if isinstance(value, bool) and types[key] is not bool:
             value = "yes" if value else "no"  # what YAML makes of `mixed_precision: no`
         if isinstance(value, list):

@@ -123,7 +123,10 @@ def base_license(base: str) -> str:
     if card.is_file():
         from huggingface_hub import ModelCard
 
-        return ModelCard.load(card).data.license or "other"
+        try:
+            return ModelCard.load(card).data.license or "other"
+        except (ValueError, yaml.YAMLError):  # somebody else's file, and no reason to stop a training
+            return "other"
     return LICENSES.get(base, "other")
 
 
@@ -194,6 +197,7 @@ def check_push(args: GiftTrainingArguments) -> None:
     if not args.push_to_hub:
         return
     from huggingface_hub import get_token
+    from huggingface_hub.utils import validate_repo_id
 
     if is_local(args.model_name_or_path):
         raise ValueError(
@@ -201,6 +205,14 @@ def check_push(args: GiftTrainingArguments) -> None:
         )
     if get_token() is None:
         raise ValueError("push_to_hub: no token; run `hf auth login` or set HF_TOKEN")
+    try:
+        validate_repo_id(_repository(args))
+    except ValueError as error:
+        raise ValueError(f"push_to_hub: {error} Give another --hub_model_id") from None
+
+
+def _repository(args: GiftTrainingArguments) -> str:
+    return args.hub_model_id or Path(args.output_dir).resolve().name
 
 
 def push(folder: Path, args: GiftTrainingArguments) -> str:
@@ -211,9 +223,8 @@ def push(folder: Path, args: GiftTrainingArguments) -> str:
     from huggingface_hub import HfApi
 
     api = HfApi()
-    name = args.hub_model_id or Path(args.output_dir).resolve().name
     try:
-        repository = api.create_repo(repo_id=name, private=args.hub_private_repo, exist_ok=True).repo_id
+        repository = api.create_repo(repo_id=_repository(args), private=args.hub_private_repo, exist_ok=True).repo_id
         api.upload_folder(
             repo_id=repository, folder_path=folder, allow_patterns=UPLOADED, commit_message="GIFT adapter"
         )

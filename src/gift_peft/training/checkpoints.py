@@ -23,6 +23,10 @@ CHECKSUMS = "checksums.json"
 OPTIMIZER = "optimizer.safetensors"
 RNG = "rng_state.safetensors"
 STATE = "trainer_state.json"
+# Temporary names of a run: of what it replaces as a whole, of that inside a checkpoint, and of single files.
+TEMPORARY = re.compile(
+    r"\.+(adapter|adapter-last|checkpoint-\d+)(\.tmp)?\.(tmp|old)|\.(metrics\.jsonl|config\.yaml)\.\d+"
+)
 
 
 def write_checkpoint(
@@ -97,7 +101,7 @@ def find_checkpoint(output_dir: Path, name: str, warn: Callable[[str], None]) ->
 def list_checkpoints(output_dir: Path) -> list[Path]:
     """The folders with a checkpoint's name, oldest step first."""
     found = [f for f in output_dir.glob("checkpoint-*") if re.fullmatch(r"checkpoint-\d+", f.name) and f.is_dir()]
-    return sorted(found, key=lambda f: int(f.name.split("-")[1]))
+    return sorted(found, key=_step)
 
 
 def checkpoint_fault(folder: Path) -> str | None:
@@ -114,10 +118,14 @@ def checkpoint_fault(folder: Path) -> str | None:
     return None
 
 
-def prune_checkpoints(output_dir: Path, limit: int | None, keep: list[int]) -> None:
-    """Delete all but the newest `limit` checkpoints; those of the steps in `keep` neither count nor go."""
-    kept = {f"checkpoint-{step}" for step in keep}
-    for folder in [f for f in list_checkpoints(output_dir) if f.name not in kept][: -limit if limit else 0]:
+def prune_checkpoints(output_dir: Path, step: int, limit: int | None, keep: list[int]) -> None:
+    """Delete all but the newest `limit` checkpoints up to `step`; those of the steps in `keep` neither count nor go.
+
+    Nor do later ones, which a run has that was resumed before them: they may be damaged, and shall not push out the
+    one that was just written.
+    """
+    found = [f for f in list_checkpoints(output_dir) if _step(f) <= step and _step(f) not in keep]
+    for folder in found[: -limit if limit else 0]:
         # Renamed first: a half-deleted folder must not look like a damaged checkpoint.
         gone = folder.with_name(f".{folder.name}.tmp")
         os.replace(folder, gone)
@@ -155,15 +163,23 @@ def disk_errors(target: Path):
 
 
 def remove_leftovers(output_dir: Path) -> None:
-    """Delete what a killed run left under temporary names; what it was about to replace gets its name back."""
-    for folder in output_dir.glob(".*.old"):
-        target = folder.with_name(folder.name[1 : -len(".old")])
-        if target.exists():
-            shutil.rmtree(folder, ignore_errors=True)
+    """Delete what a killed run left under temporary names; what it was about to replace gets its name back.
+
+    Other hidden files of the folder are not ours.
+    """
+
+    def leftovers() -> list[Path]:
+        return [path for path in output_dir.iterdir() if TEMPORARY.fullmatch(path.name)]
+
+    for path in leftovers():
+        target = path.with_name(path.name[1 : -len(".old")])
+        if path.suffix == ".old" and not target.exists():
+            os.replace(path, target)
+    for path in leftovers():
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
         else:
-            os.replace(folder, target)
-    for folder in output_dir.glob(".*.tmp"):
-        shutil.rmtree(folder, ignore_errors=True)
+            path.unlink(missing_ok=True)
 
 
 def optimizer_tensors(model: torch.nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
@@ -194,6 +210,10 @@ def _rng_tensors() -> dict[str, torch.Tensor]:
     if torch.cuda.is_available():
         tensors["cuda"] = torch.cuda.get_rng_state()
     return tensors
+
+
+def _step(checkpoint: Path) -> int:
+    return int(checkpoint.name.split("-")[1])
 
 
 def _files(folder: Path) -> list[Path]:

@@ -4,6 +4,8 @@ Frozen model -> proxies -> adapter with the paper's trainable parts -> one Adam 
 shuffled once per epoch -> validation after every epoch -> the adapter with the smallest validation GCE.
 """
 
+import hashlib
+import shlex
 import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -127,7 +129,9 @@ class Run:
         try:
             make_proxies(args.model_name_or_path, args.dataset_name, accelerator=self.accelerator, **places)
         except PermissionError as error:
-            command = proxies_command(args.model_name_or_path, args.dataset_name, args.size, args.proxies_dir)
+            size = "x".join(map(str, self.size))
+            options = (size, args.proxies_dir, args.model_revision)
+            command = proxies_command(args.model_name_or_path, args.dataset_name, *options)
             raise PermissionError(f"proxies are missing and {error.filename} cannot be written: `{command}`") from None
         splits = gift_i_splits(args.dataset_name)
         if "train" not in splits:
@@ -152,6 +156,8 @@ class Run:
         return identity | {
             "model_name_or_path": teacher_revision(args.model_name_or_path, args.model_revision),
             "dataset_name": broadcast_object_list(fingerprint)[0],
+            # The fingerprint does not depend on it, the order of the updates does.
+            "group_order": hashlib.sha256("\n".join(self.train_groups.dataset["group_id"]).encode()).hexdigest()[:32],
             "size": "x".join(map(str, self.size)),
             "mixed_precision": self.accelerator.mixed_precision,
         }
@@ -187,11 +193,14 @@ class Run:
         """One Adam step on one group (Eq. 6); returns (loss, consistency)."""
         try:
             output = self.group_step.accumulate(group.pixel_values, group.mask, group.target, group.valid, group.names)
-        except ValueError as error:
+            self.optimizer.step()
+            weights = [p.detach() for p in self.optimizer.param_groups[0]["params"]]
+            if not torch.nn.utils.get_total_norm(weights, torch.inf).isfinite():
+                raise ValueError("the update made weights NaN or infinite")
+        except (ValueError, torch.OutOfMemoryError) as error:
             found = checkpoints.list_checkpoints(self.output)
-            last = f"the last good checkpoint is {found[-1]}" if found else "no checkpoint had been written yet"
+            last = f"the last checkpoint is {found[-1]}" if found else "no checkpoint had been written yet"
             raise ValueError(f"step {state.step + 1}, group {group.group_id}: {error}; {last}") from error
-        self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         state.step += 1
         loss, consistency, distillation = (float(value) for value in output[:3])
@@ -267,7 +276,7 @@ class Run:
                 best=self.output / "adapter" if state.best_step else None,
             )
             limit, keep = self.args.checkpoints_total_limit, self.args.checkpoint_at_steps
-            checkpoints.prune_checkpoints(self.output, limit, keep)
+            checkpoints.prune_checkpoints(self.output, state.step, limit, keep)
         self.accelerator.wait_for_everyone()
 
     def restore(self, checkpoint: Path) -> State:
@@ -298,6 +307,8 @@ class Run:
             return
         adapter, row = self.output / "adapter", state.row_of(state.best_step or state.step)
         print(f"Adapter: {adapter} (step {row['step']})")
+        if self.validation_groups and state.best_step is None:
+            print("  In no validation group two target masks meet: it is the last adapter, chosen by nothing")
         for title, key in (
             ("validation GCE", "val_gce"),
             ("ToM RMSE", "val_tom_rmse"),
@@ -343,9 +354,7 @@ class Run:
 def _recipe(args: GiftTrainingArguments, base: torch.nn.Module) -> tuple[GiftRecipe, str]:
     """(recipe, what the model predicts): the one the arguments spell out, else the one for the model's type."""
     spelled = None
-    if args.target_modules or args.modules_to_save:
-        if not (args.target_modules and args.modules_to_save):
-            raise ValueError("target_modules and modules_to_save: give both or neither")
+    if args.target_modules:
         spelled = GiftRecipe(args.target_modules, args.modules_to_save, args.prediction_kind)
     try:
         recipe = get_recipe(base, spelled)
@@ -357,10 +366,14 @@ def _recipe(args: GiftTrainingArguments, base: torch.nn.Module) -> tuple[GiftRec
 
 def _check_identity(before: dict, now: dict) -> None:
     """Raise ValueError naming the first argument that changed since the checkpoint."""
-    changed = {"model_name_or_path": "the base model's weights", "dataset_name": "its images, masks or groups"}
+    changed = {
+        "model_name_or_path": "the base model's weights have",
+        "dataset_name": "its images, masks or groups have",
+        "group_order": "the order of the training groups has",
+    }
     for name in sorted(before.keys() | now.keys()):
         if before.get(name) != now.get(name):
-            what = f"{changed[name]} have" if name in changed else f"{before.get(name)} became {now.get(name)}, it has"
+            what = changed.get(name, f"{before.get(name)} became {now.get(name)}, it has")
             raise ValueError(f"resume_from_checkpoint: {name}: {what} changed since the checkpoint was written")
 
 
@@ -368,5 +381,5 @@ def _how_to_resume(output: Path, step: int) -> str:
     config = output / "config.yaml"
     return (
         f"Stopped after step {step}; {output}/checkpoint-{step} is complete. Go on with\n"
-        f"  gift-peft train --config {config} --resume_from_checkpoint latest"
+        f"  gift-peft train --config {shlex.quote(str(config))} --resume_from_checkpoint latest"
     )

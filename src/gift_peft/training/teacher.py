@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import torch
 from accelerate import PartialState
-from accelerate.utils import gather_object
+from accelerate.utils import gather_object, parse_flag_from_env
+from safetensors import SafetensorError
 from tqdm import tqdm
 
 from gift_peft.data.gift_i import gift_i_splits, load_gift_i, proxies_command
@@ -40,7 +41,7 @@ def load_teacher(base: str | Path, revision: str | None = None) -> tuple[torch.n
     try:
         model = AutoModelForDepthEstimation.from_pretrained(base, revision=revision, dtype=torch.float32)
         return model.eval(), AutoImageProcessor.from_pretrained(base, revision=revision)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:  # weights of another shape, a cut-off file
         raise ValueError(f"base model {base}: {str(error).strip().splitlines()[0]}") from error
 
 
@@ -75,12 +76,12 @@ def make_proxies(
         `Path`: `<proxies_dir>/<teacher>`.
 
     Raises:
-        ValueError, FileNotFoundError: in every process, one line naming the file, or group and image: stale proxies,
-            NaN predictions, unreadable data.
+        ValueError, OSError: in every process, one line naming the file, or group and image: stale proxies, NaN
+            predictions, unreadable data, a folder that cannot be written.
     """
     from gift_peft.adapters import RECIPES
 
-    state = accelerator or PartialState()
+    state = accelerator or PartialState(cpu=parse_flag_from_env("ACCELERATE_USE_CPU"))
     identity = teacher_id(base, revision)
     pinned = teacher_revision(base, revision)
     model, processor = load_teacher(base, revision)
@@ -102,7 +103,7 @@ def make_proxies(
                 expected = header | row_digests(row)
                 if overwrite or not _is_current(path, expected, row["image_names"], command):
                     write_proxies(path, expected, *_predict_row(model, processor, row, size, batch_size))
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, OSError) as error:
         problem = error
     _raise_everywhere(problem, state)
     return folder

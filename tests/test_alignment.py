@@ -200,6 +200,9 @@ def test_protocols_state_their_choices():
         assert protocol.name == name and protocol.source and protocol.describe().startswith(f"{name}: ")
     assert "clip 1..10000 mm" in PROTOCOLS["gift"].describe()
     assert "no clipping" in PROTOCOLS["native"].describe()
+    for wrong in ({"space": "depth"}, {"dof": "median"}, {"loss": "l1"}, {"resolution": 0.25}):
+        with pytest.raises(ValueError, match=f"protocol 'mine': {next(iter(wrong))} .*; what is computed is"):
+            Protocol("mine", **{"space": "auto"} | wrong)
     mine = Protocol("mine", space="auto", clip=(1.0, 2000.0))
     assert get_protocol(mine) is mine and mine.to_dict()["clip"] == [1.0, 2000.0]
     assert align(scene(1) / 5, scene(1), ALL, mine).aligned.max() == 2000

@@ -67,6 +67,14 @@ def test_demo_leaves_everything_it_promises(embedded, tmp_path, monkeypatch, cap
     assert len(Path("demo/metrics.jsonl").read_text().splitlines()) == 2
 
 
+@pytest.mark.parametrize("argument", ["--output_dir=x", "--dataset_name=mine", "--model_name_or_path=x/base"])
+def test_what_the_demo_brings_itself_is_not_replaced(embedded, tmp_path, argument):
+    name = argument[2:].split("=")[0]
+    with pytest.raises(ValueError, match=f"{name}: the demo has its own"):
+        run.run_demo(tmp_path / "demo", extra=[argument])
+    assert not (tmp_path / "demo").exists()
+
+
 def test_a_package_without_its_assets_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "files", lambda package: tmp_path / "nothing")
     with pytest.raises(FileNotFoundError, match="lacks gift_peft/demo/base"):

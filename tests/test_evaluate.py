@@ -16,6 +16,7 @@ from gift_peft.data.gift_i import load_gift_i
 from gift_peft.data.preprocess import Group
 from gift_peft.data.writer import write_gift_i
 from gift_peft.evaluation.evaluate import evaluate_gift_i, make_panel, run_evaluation
+from gift_peft.evaluation.report import text_table
 from gift_peft.evaluation.results import REGIONS, GiftIReport
 from gift_peft.evaluation.scoring import consensus
 from gift_peft.training.teacher import make_proxies
@@ -125,6 +126,7 @@ def test_rows_and_summaries_against_straight_line_code(valid):
         "skipped": 0,
         "reasons": {},
         "without_tom": 0,
+        "without_other": 0,
     }
 
 
@@ -211,6 +213,32 @@ def test_missing_references_and_empty_targets_are_counted_not_averaged():
     assert [math.isnan(value) for value in tom] == [True] * 4 + [False] * 2
     assert report.summary["tom"]["mae"] == pytest.approx(np.mean(tom[4:]))
     assert report.gce["num_groups"] == 2
+
+
+def test_unknown_depth_all_over_the_target_is_counted(tmp_path):
+    rng = np.random.default_rng(5)
+    mask = np.zeros((28, 28), bool)
+    mask[5:20, 5:20] = True
+    depth = rng.integers(500, 900, (28, 28)).astype(np.uint16)
+    blind = np.where(mask, 0, depth).astype(np.uint16)  # a depth camera sees nothing on glass
+    pictures = [Image.fromarray(rng.integers(0, 255, (28, 28, 3), dtype=np.uint8)) for _ in range(3)]
+    group = {"split": "validation", "group_id": "g", "surface": "transparent", "masks": [mask, mask, mask | True]}
+    write_gift_i([group | {"images": pictures, "depths": [depth, blind, depth]}], tmp_path, license="cc0-1.0")
+    report = evaluate(
+        load_gift_i(tmp_path, "validation"), reference="depth", kind="depth", processor=tiny_processor(), size=(28, 28)
+    )
+    assert (report.counts["scored"], report.counts["without_tom"], report.counts["without_other"]) == (3, 1, 1)
+    assert report.by_surface["transparent"]["num_images"] == 2
+    assert "1 without known target pixels, 1 with nothing else" in text_table(report)
+
+
+def test_no_target_anywhere_is_no_collapse():
+    group = make_group(0)
+    group.mask[:] = False
+    report = evaluate([group])
+    assert math.isnan(report.collapse["target_mean_ratio"]) and not report.collapse["alarm"]
+    assert evaluate([group], lambda pixels: 0.3 * pixels[:, 0]).collapse["alarm"]
+    assert evaluate([make_group(0)], teacher=lambda pixels: 0 * pixels[:, 0]).collapse["alarm"]
 
 
 def test_without_references_there_is_gce_alone():

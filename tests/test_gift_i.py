@@ -327,6 +327,37 @@ def test_a_third_mask_value_in_a_prepared_folder_names_the_image(prepared):
     one_line(excinfo, "group scene_0: the mask of 1.png: 3 different values")
 
 
+def test_groups_with_and_without_a_reference_share_a_split(tmp_path):
+    for index in range(3):
+        write_group(tmp_path / "raw/validation" / f"scene_{index}", 2, index, reference=index != 1)
+    (tmp_path / "raw/train").mkdir()
+    groups = [{**group, "split": "validation", "surface": None} for group in records(tmp_path / "raw")]
+    for folder in (tmp_path / "raw", write_gift_i(groups, tmp_path / "gift-i", license="cc0-1.0")):
+        rows = load_gift_i(folder, "validation")
+        assert [row["reference"] is None for row in rows] == [False, True, False]
+    datasets.load_dataset(str(folder), split="validation").to_parquet(
+        tmp_path / "parquet/validation-00000-of-00001.parquet"
+    )
+    rows = load_gift_i(tmp_path / "parquet", "validation")
+    assert [row["reference"] is None for row in rows] == [False, True, False]
+
+
+def test_misnamed_validation_folder(raw_tree):
+    (raw_tree / "validation").rename(raw_tree / "val")
+    with pytest.raises(ValueError) as excinfo:
+        load_gift_i(raw_tree, "train")
+    one_line(excinfo, raw_tree / "val", "the second split is called validation")
+
+
+def test_writer_takes_masks_that_are_bool(tmp_path):
+    pictures = [Image.new("RGB", (8, 6), (value, 0, 0)) for value in (1, 2)]
+    for mask in (np.ones((6, 8), np.int64), np.ones((6, 8, 1), bool)):
+        group = {"split": "train", "group_id": "g", "images": pictures, "masks": [mask, mask]}
+        with pytest.raises(ValueError) as excinfo:
+            write_gift_i([group], tmp_path / "gift-i", license="cc0-1.0")
+        one_line(excinfo, "group g: the mask of 00.png: a mask is (H, W) bool", mask.dtype)
+
+
 def test_group_of_one(raw_tree):
     (raw_tree / "train/scene_0/1.png").unlink()
     with pytest.raises(ValueError) as excinfo:
@@ -372,6 +403,8 @@ def test_wrong_folders_and_splits(tmp_path, raw_tree, prepared):
     assert "group.yaml: surface 'chrome'" in error(raw_tree, "train")
     (raw_tree / "train/scene_0/group.yaml").write_text("surfce: mirror")
     assert "group.yaml: it may have the keys" in error(raw_tree, "train")
+    (raw_tree / "train/scene_0/group.yaml").write_bytes(b"notes: caf\xe9")
+    assert "group.yaml: not valid YAML" in error(raw_tree, "train")
     (raw_tree / "train/scene_0/group.yaml").unlink()
     shutil.copy(raw_tree / "train/scene_0/0.png", raw_tree / "train/scene_0/0.jpg")
     assert "would share one mask" in error(raw_tree, "train")

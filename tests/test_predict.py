@@ -157,6 +157,11 @@ def test_an_adapter_for_other_weights_is_refused(adapter_dir, base_dir, tmp_path
     other = write_base(tmp_path / "other", seed=1)
     with pytest.raises(ValueError, match=r"adapter .* was trained on .*, whose files are not those of base .*other"):
         load_model(other, adapter_dir)
+    plain = shutil.copytree(adapter_dir, tmp_path / "plain")
+    (plain / "gift.json").unlink()  # as PEFT alone saves: the folder it names still tells
+    with pytest.raises(ValueError, match=r"whose files are not those of base .*other"):
+        load_model(other, plain)
+    assert load_model(base_dir, plain).size == SIZE
     moved = shutil.copytree(base_dir, tmp_path / "moved")
     assert load_model(moved, adapter_dir).size == SIZE
 
@@ -164,6 +169,8 @@ def test_an_adapter_for_other_weights_is_refused(adapter_dir, base_dir, tmp_path
 def test_an_adapter_for_other_shapes_or_layers_is_refused(adapter_dir, base_dir, tmp_path):
     silent = shutil.copytree(adapter_dir, tmp_path / "silent")
     (silent / "gift.json").unlink()
+    config = (silent / "adapter_config.json").read_text()
+    (silent / "adapter_config.json").write_text(config.replace(str(base_dir), "a/folder/elsewhere"))
     wide = shutil.copytree(base_dir, tmp_path / "wide")
     config = tiny_model().config
     config.fusion_hidden_size = 8

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from gift_peft.evaluation.colormap import GREY
 from gift_peft.evaluation.protocols import PROTOCOLS
@@ -64,6 +64,7 @@ def make_report(**changes) -> GiftIReport:
             "skipped": 2,
             "reasons": {"without a treated reference": 2},
             "without_tom": 1,
+            "without_other": 0,
         },
         "protocol": PROTOCOLS["native"].to_dict() | {"description": PROTOCOLS["native"].describe()},
         "reference": "proxy",
@@ -143,7 +144,7 @@ def test_markdown_table_is_well_formed_and_bold_where_better():
 def test_every_table_states_protocol_skips_and_collapse(table):
     text = " ".join(table(make_report()).split())
     assert PROTOCOLS["native"].describe() in text
-    assert "Skipped: 2 of 30 images (2 without a treated reference); 1 without target pixels" in text
+    assert "Skipped: 2 of 30 images (2 without a treated reference); 1 without known target pixels; GCE" in text
     assert "GCE over 7 groups, 1 without a pair" in text
     assert "target mean x0.98000, spread x0.90000: no collapse alarm (outside 0.5..2)" in text
     alarmed = {"target_mean_ratio": 0.3, "spread_ratio": 0.9, "alarm": True}
@@ -243,3 +244,12 @@ def test_before_after_refuses_what_it_cannot_draw(tmp_path):
     with pytest.raises(ValueError, match="shapes must agree"):
         before_after([panel(base=np.ones((3, 4)))], tmp_path / "x.png")
     assert not list(tmp_path.iterdir())
+
+
+def test_before_after_says_where_the_target_has_no_reference(tmp_path, monkeypatch):
+    captions = []
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda self, at, text, **_: captions.append(text))
+    blind = panel()
+    blind.reference[blind.target] = 0
+    before_after([panel(), blind], tmp_path / "figure.png")
+    assert "mm before, " in captions[0] and "RMSE in the outline: unknown" in captions[1]

@@ -338,6 +338,14 @@ def test_missing_proxy_names_file_and_command(raw_tree, base_dir):
     one_line(excinfo, raw_tree / "proxies" / base_dir.name / "train/scene_0.safetensors", f"`{command}`")
 
 
+def test_a_proxy_file_that_lacks_an_image(raw_tree, base_dir):
+    path = make_proxies(base_dir, raw_tree, size=SIZE) / "train/scene_1.safetensors"
+    write_proxies(path, read_header(path), safetensors.torch.load_file(path)["proxies"][:2], None)
+    with pytest.raises(ValueError) as excinfo:
+        load_gift_i(raw_tree, "train", teacher=base_dir)[1]
+    one_line(excinfo, f"damaged proxy {path} (it holds 2 of 3 proxies)", "gift-peft proxies")
+
+
 def test_damaged_and_nan_proxies(raw_tree, base_dir):
     path = make_proxies(base_dir, raw_tree, size=SIZE) / "validation/scene_100.safetensors"
     tensors, header = safetensors.torch.load_file(path), read_header(path)

@@ -274,6 +274,7 @@ def _check_row(table: pa.Table, split: str) -> tuple[list[int], int]:
 
 
 def _check_present(files: pa.StructArray | None, missing: str) -> None:
+    files = None if files is None else files.drop_null()  # a null's fields may hold anything, an empty path for one
     for file in [] if files is None else files.field("path").filter(files.field("bytes").is_null()).to_pylist():
         if file is not None and "://" not in file and not os.path.exists(file):
             raise FileNotFoundError(f"{missing} {file}")

@@ -180,7 +180,10 @@ def check_group(
             f"but the image {names[0]} is {size[0]}x{size[1]}"
         )
     if train and not any(mask.any() for mask in masks):
-        raise ValueError(f"group {group_id}: every mask is empty, so there is nothing to train on; draw the target")
+        raise ValueError(
+            f"group {group_id}: every mask is empty, so there is nothing to train on; draw the target in 255, "
+            "or name its value in group.yaml (`mask_class: 2`)"
+        )
 
 
 # ---- resizing ----

@@ -191,6 +191,11 @@ class ProxyStore:
             raise ValueError(
                 f"damaged proxy {path} (not a proxy file); make it again with `{self.command} --overwrite`"
             )
+        if len(tensors["proxies"]) != len(header.get("images", tensors["proxies"])):
+            raise ValueError(
+                f"damaged proxy {path} (it holds {len(tensors['proxies'])} of {len(header['images'])} proxies); "
+                f"make it again with `{self.command} --overwrite`"
+            )
         for name, proxy in [*zip(names, tensors["proxies"], strict=False), ("reference", tensors.get("reference"))]:
             if proxy is not None and not proxy.isfinite().all():
                 raise ValueError(

@@ -57,6 +57,9 @@ def list_groups(root: str | Path) -> dict[str, list[Path]]:
             f"{root} is a prepared folder, not a raw tree: use load_gift_i or load_dataset({str(root)!r})"
         )
     found: dict[str, list[Path]] = {split: [] for split in SPLITS}
+    for name in ("val", "valid"):
+        if (root / name).is_dir() and (root / "train").is_dir():  # else it would be ignored without a word
+            raise ValueError(f"{root / name}: the second split is called validation; rename the folder")
     if any((root / split).is_dir() for split in SPLITS):
         found = {split: _subfolders(root / split) for split in SPLITS}
     else:
@@ -156,8 +159,8 @@ def _facts(folder: Path) -> dict:
     if not path.exists():
         return {}
     try:
-        facts = yaml.safe_load(path.read_text()) or {}
-    except yaml.YAMLError as error:
+        facts = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
     if not isinstance(facts, dict) or not facts.keys() <= GROUP_KEYS:
         raise ValueError(f"{path}: it may have the keys {', '.join(sorted(GROUP_KEYS))} and no others")

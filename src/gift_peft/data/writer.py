@@ -168,6 +168,8 @@ def _rgb(source, name: str) -> Image.Image:
 
 def _mask(source, name: str) -> np.ndarray:
     if isinstance(source, np.ndarray):
+        if source.ndim != 2 or source.dtype not in (bool, np.uint8):
+            raise ValueError(f"{name}: a mask is (H, W) bool, got {source.shape} {source.dtype}")
         return to_mask(Image.fromarray(source.astype(np.uint8) if source.dtype == bool else source), name)
     at = name if isinstance(source, Image.Image) else f"{source}"
     return to_mask(open_image(source, at), at)

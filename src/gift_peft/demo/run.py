@@ -45,6 +45,9 @@ def run_demo(
     if overwrite_output_dir:
         argv.append("--overwrite_output_dir")
     args = parse_arguments(argv)
+    for name, value in (("model_name_or_path", f"{out}/base"), ("dataset_name", f"{out}/gift-i"), ("output_dir", out)):
+        if Path(getattr(args, name)) != Path(value):
+            raise ValueError(f"{name}: the demo has its own; choose the folder with --out, or use `gift-peft train`")
     if (out / "metrics.jsonl").exists() and not overwrite_output_dir and not args.resume_from_checkpoint:
         raise ValueError(
             f"out: {out} already holds a run; --overwrite_output_dir deletes it, --out names another folder"

@@ -60,8 +60,9 @@ def check_shapes(**arrays: np.ndarray) -> None:
 
 def check_mask(name: str, mask: Any) -> np.ndarray:
     """A boolean array; ValueError for any other type, because 0/255 masks index silently wrong."""
-    if str(mask.dtype).removeprefix("torch.") != "bool":
-        raise ValueError(f"{name} must be boolean, got {mask.dtype}")
+    dtype = getattr(mask, "dtype", type(mask).__name__)
+    if str(dtype).removeprefix("torch.") != "bool":
+        raise ValueError(f"{name} must be boolean, got {dtype}")
     return to_numpy(mask, bool)
 
 

@@ -279,7 +279,7 @@ def _report(groups: list[dict], rows: list[dict], task: Task) -> GiftIReport:
         gce=summarize_gce(groups, task.models),
         collapse=detect_collapse(rows) if compared else None,
         by_surface=by_surface(rows, task.models, subject),
-        counts=count_rows(rows, len(groups)),
+        counts=count_rows(rows, len(groups), subject),
         protocol=task.protocol.to_dict() | {"description": task.protocol.describe()},
         reference=task.reference,
         adapted=subject == "adapted",

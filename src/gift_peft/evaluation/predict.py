@@ -243,10 +243,13 @@ def _attach(model, processor, base, adapter, revision):
 def _check_base(base, revision, adapter, made_for: str | None) -> None:
     """ValueError unless the adapter was trained on this base, as far as weights and names tell.
 
-    Two folders are compared by the digest in gift.json, two hub ids by name. A folder here for a hub id there, or the
+    Two folders are compared by the digest in gift.json (without it, of the folder named, if that is still there), two
+    hub ids by name. A folder here for a hub id there, or the
     other way round, may be a copy: then shapes alone decide.
     """
     trained, present = _read_gift(adapter).get("base_revision") or "", teacher_revision(base, revision)
+    if not trained and made_for and (Path(made_for) / "config.json").is_file():
+        trained = teacher_revision(made_for)
     was_folder, is_folder = (pin.startswith("sha256:") for pin in (trained, present))
     if was_folder and is_folder and trained != present:
         raise ValueError(f"adapter {adapter} was trained on {made_for}, whose files are not those of base {base}")

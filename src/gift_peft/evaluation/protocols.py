@@ -7,6 +7,15 @@ Every table prints the protocol it was made with. `gift` is the paper's affine-a
 from dataclasses import asdict, dataclass
 
 KINDS = ("depth", "inverse_depth")
+# A choice that nothing computes must not stand under a table.
+IMPLEMENTED = {
+    "space": ("auto", "native"),
+    "dof": ("scale_shift",),
+    "loss": ("l2",),
+    "fit_region": ("valid",),
+    "aggregation": ("image",),
+    "resolution": (1.0,),
+}
 
 
 @dataclass(frozen=True)
@@ -38,6 +47,13 @@ class Protocol:
     resolution: float = 1.0
     unit: str = "mm"
     source: str = ""
+
+    def __post_init__(self) -> None:
+        for name, choices in IMPLEMENTED.items():
+            value = getattr(self, name)
+            if value not in choices:
+                known = ", ".join(map(str, choices))
+                raise ValueError(f"protocol {self.name!r}: {name} {value!r}; what is computed is {known}")
 
     def describe(self) -> str:
         """One line with every choice, as it stands under a table."""

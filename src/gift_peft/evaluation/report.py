@@ -179,10 +179,11 @@ def _notes(report: GiftIReport) -> list[str]:
         notes.append(NO_TEACHING)
     counts, gce = report.counts, report.gce
     reasons = ", ".join(f"{n} {reason}" for reason, n in counts["reasons"].items())
+    other = f", {counts['without_other']} with nothing else" if counts["without_other"] else ""
     notes.append(f"Protocol {report.protocol['description']}.")
     notes.append(
         f"Skipped: {counts['skipped']} of {_count(counts['images'], 'image')}{f' ({reasons})' if reasons else ''}; "
-        f"{counts['without_tom']} without target pixels; GCE over {_count(gce['num_groups'], 'group')}, "
+        f"{counts['without_tom']} without known target pixels{other}; GCE over {_count(gce['num_groups'], 'group')}, "
         f"{gce['num_skipped']} without a pair."
     )
     return notes
@@ -263,7 +264,8 @@ def _draw_row(panel: Panel) -> Image.Image:
     strip = Image.new("RGB", (GAP + 4 * (TILE_WIDTH + GAP), CAPTION + height + GAP), "white")
     errors = [depth_metrics(depth, panel.reference, panel.target)["rmse"] for depth in aligned]
     before, after, near, far = (f"{v:.0f} mm" if in_depth else f"{v:.3g}" for v in (*errors, low, high))
-    caption = f"{panel.label}   RMSE in the outline: {before} before, {after} after   (colours {near} to {far})"
+    scores = "unknown" if np.isnan(errors).any() else f"{before} before, {after} after"
+    caption = f"{panel.label}   RMSE in the outline: {scores}   (colours {near} to {far})"
     font = ImageFont.load_default(size=17)
     ImageDraw.Draw(strip).text((GAP, CAPTION // 2), caption, fill="black", font=font, anchor="lm")
     for index, picture in enumerate((panel.image, *map(Image.fromarray, maps))):

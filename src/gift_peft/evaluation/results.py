@@ -30,8 +30,9 @@ class GiftIReport:
         gce (`dict`): `base`, `adapted`, `base_normalized`, `adapted_normalized` (None where that model was not run),
             `num_groups`, `num_skipped`.
         collapse (`dict`, *optional*): adapted/base ratios `target_mean_ratio` and `spread_ratio`, and `alarm`.
-        by_surface (`dict`): {surface: {`num_images`, `summary`, `base`, `consensus`}}.
-        counts (`dict`): `groups`, `images`, `scored`, `skipped`, `reasons` ({reason: images}), `without_tom`.
+        by_surface (`dict`): {surface: {`num_images` with a scored target, `summary`, `base`, `consensus`}}.
+        counts (`dict`): `groups`, `images`, `scored`, `skipped`, `reasons` ({reason: images}), and
+            `without_tom`, `without_other`: scored images that have no known pixel in that region.
         protocol (`dict`): the protocol's choices; `description` is the line under every table.
         reference (`str`): `proxy` or `depth`.
         adapted (`bool`): whether `summary` is of an adapted model, or of the base itself.
@@ -123,7 +124,10 @@ def summarize_gce(groups: list[dict], models: list[str]) -> dict:
 
 
 def detect_collapse(rows: list[dict]) -> dict:
-    """Did the adapted outputs shrink, grow or flatten? A ratio outside [0.5, 2], or undefined, raises the alarm."""
+    """Did the adapted outputs shrink, grow or flatten? A ratio outside [0.5, 2], or over zero, raises the alarm.
+
+    Without a single target pixel there is no mean target prediction, and only the spread is checked.
+    """
     target_mean, spread = (
         [[row[model][name] for row in rows if not math.isnan(row[model][name])] for model in ("adapted", "base")]
         for name in ("target_mean", "spread")
@@ -133,14 +137,15 @@ def detect_collapse(rows: list[dict]) -> dict:
         "spread_ratio": _ratio(*(float(np.median(values)) if values else math.nan for values in spread)),
     }
     low, high = COLLAPSE_RANGE
-    return ratios | {"alarm": any(not low <= ratio <= high for ratio in ratios.values())}
+    checked = [ratio for name, ratio in ratios.items() if name != "target_mean_ratio" or target_mean[1]]
+    return ratios | {"alarm": any(not low <= ratio <= high for ratio in checked)}
 
 
 def _ratio(adapted: float, base: float) -> float:
     return adapted / base if base else math.nan
 
 
-def count_rows(rows: list[dict], num_groups: int) -> dict:
+def count_rows(rows: list[dict], num_groups: int, subject: str) -> dict:
     """How many images the means are over, and why others are not in them."""
     reasons = Counter(row["skipped"] for row in rows if row["skipped"])
     skipped = sum(reasons.values())
@@ -150,8 +155,14 @@ def count_rows(rows: list[dict], num_groups: int) -> dict:
         "scored": len(rows) - skipped,
         "skipped": skipped,
         "reasons": dict(sorted(reasons.items())),
-        "without_tom": sum(not row["skipped"] and not row["target_pixels"] for row in rows),
+        "without_tom": len(rows) - skipped - count_scored(rows, subject, "tom"),
+        "without_other": len(rows) - skipped - count_scored(rows, subject, "other"),
     }
+
+
+def count_scored(rows: list[dict], subject: str, region: str) -> int:
+    """Images with a value in the region; not those without its pixels, or whose reference is unknown all over it."""
+    return sum(not row["skipped"] and not math.isnan(row[subject][region]["mae"]) for row in rows)
 
 
 def by_surface(rows: list[dict], models: list[str], subject: str) -> dict:
@@ -160,7 +171,7 @@ def by_surface(rows: list[dict], models: list[str], subject: str) -> dict:
     result = {}
     for surface in surfaces:
         own = [row for row in rows if (row["surface"] or "unknown") == surface]
-        result[surface] = {"num_images": sum(not row["skipped"] for row in own), "summary": summarize(own, subject)}
+        result[surface] = {"num_images": count_scored(own, subject, "tom"), "summary": summarize(own, subject)}
         for model in ("base", "consensus"):
             result[surface][model] = summarize(own, model) if model in models else None
     return result

@@ -232,6 +232,13 @@ def test_unknown_depth_all_over_the_target_is_counted(tmp_path):
     assert "1 without known target pixels, 1 with nothing else" in text_table(report)
 
 
+def test_protocols_that_do_not_fit_the_reference_are_refused():
+    with pytest.raises(ValueError, match='protocol gift aligns to depth in mm; proxies are in native units: use "nat'):
+        evaluate([make_group(0)], protocol="gift")
+    with pytest.raises(ValueError, match="protocol native would fit inverse depth straight to depth"):
+        evaluate([make_group(0)], protocol="native", reference="depth", kind="inverse_depth")
+
+
 def test_no_target_anywhere_is_no_collapse():
     group = make_group(0)
     group.mask[:] = False
@@ -291,7 +298,7 @@ def test_bad_predictions_and_arguments_are_named():
     with pytest.raises(ValueError, match="unknown protocol 'mine'"):
         evaluate([group], protocol="mine")
     with pytest.raises(ValueError, match="kind="):
-        evaluate([group], protocol="gift")
+        evaluate([group], reference="depth")
     with pytest.raises(ValueError, match="needs a model"):
         evaluate_gift_i([group])
     with pytest.raises(ValueError, match="no groups"):

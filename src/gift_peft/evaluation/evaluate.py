@@ -73,7 +73,8 @@ def evaluate_gift_i(
 
     Raises:
         ValueError: a non-finite prediction (naming group and image), a prediction of another size than the image,
-            an unknown reference, kind or protocol, a dataset without the reference asked for.
+            an unknown reference, kind or protocol, a protocol in another space than the reference, a dataset without
+            the reference asked for.
     """
     if reference not in REFERENCES:
         raise ValueError(f"unknown reference {reference!r}: choose one of {', '.join(REFERENCES)}")
@@ -82,9 +83,16 @@ def evaluate_gift_i(
     if isinstance(dataset, str | Path):
         dataset = load_gift_i(dataset, "validation")
     rules = get_protocol(protocol or REFERENCES[reference])
+    if reference == "proxy" and rules.space != "native":
+        raise ValueError(
+            f'protocol {rules.name} aligns to depth in {rules.unit}; proxies are in native units: use "native", or '
+            'reference="depth"'
+        )
     if kind is None:
-        # In `native` nothing is ever inverted, so a callable without a recipe need not say what it predicts.
-        kind = "depth" if rules.space == "native" else prediction_kind(model)
+        # Against proxies nothing is ever inverted, so a callable without a recipe need not say what it predicts.
+        kind = "depth" if reference == "proxy" else prediction_kind(model)
+    if reference == "depth" and rules.space == "native" and kind == "inverse_depth":
+        raise ValueError(f'protocol {rules.name} would fit inverse depth straight to depth; use "gift"')
     predictors, frozen = _predictors(model, teacher, baseline, batch_size)
     models = [*predictors, *(["consensus"] if "base" in predictors else [])]
     task = Task(predictors, frozen, models, rules, reference, kind)

@@ -187,7 +187,8 @@ def _list_images(images: Sequence[str | Path]) -> list[Path]:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
         raise FileNotFoundError(f"no such image: {missing[0]}{more}")
     if not files:
-        raise ValueError(f"no images in {', '.join(map(str, images)) or 'an empty list'}")
+        listed = ", ".join(map(str, images)) or "an empty list"
+        raise ValueError(f"no images in {listed} (folders within folders are not searched)")
     return files
 
 

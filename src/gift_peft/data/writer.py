@@ -57,8 +57,9 @@ target changes. `masks` mark the target in each image, `reference` is the same s
 
 ```python
 import datasets
-groups = datasets.load_dataset("path/to/this/folder")  # plain rows
 import gift_peft
+
+groups = datasets.load_dataset("path/to/this/folder")  # plain rows
 groups = gift_peft.load_gift_i("path/to/this/folder", "train")  # checked rows, with proxies if a teacher is named
 ```
 """

@@ -233,3 +233,12 @@ def test_colours_near_is_bright_and_unknown_is_grey():
     # Lightness rises along the whole map: readable without colour.
     ramp = colorize(np.linspace(0, 1, 256)[None], 0, 1, "inverse_depth")[0] @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(ramp) > -0.5).all() and ramp[-1] > 4 * ramp[0]
+
+
+def test_a_truncated_base_is_one_line(base_dir, tmp_path):
+    base = tmp_path / "cut"
+    shutil.copytree(base_dir, base)
+    weights = (base / "model.safetensors").read_bytes()
+    (base / "model.safetensors").write_bytes(weights[: len(weights) // 2])
+    with pytest.raises(ValueError, match=r"^base model .*cut: [^\n]+$"):
+        load_model(base)

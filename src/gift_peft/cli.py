@@ -176,7 +176,7 @@ def _predict(args: argparse.Namespace, rest: list[str]) -> int:
         kind=args.kind,
         revision=args.revision,
     )
-    print(f"Written: {len(files)} depth maps in {args.out}")
+    print(f"Depth maps written to {args.out}: {len(files)}")
     return 0
 
 

@@ -61,6 +61,7 @@ def load_model(
         FileNotFoundError: no model or adapter at that place.
         ValueError: the adapter was made for another base, or no size is known.
     """
+    from safetensors import SafetensorError
     from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
     from gift_peft.adapters import get_recipe, set_adapter_scale
@@ -70,6 +71,8 @@ def load_model(
         processor = AutoImageProcessor.from_pretrained(base, revision=revision, backend="pil")
     except OSError as error:
         raise FileNotFoundError(f"base model {base}: {_first_line(error)}") from None
+    except (ValueError, RuntimeError, SafetensorError) as error:  # weights of another shape, a cut-off file
+        raise ValueError(f"base model {base}: {_first_line(error)}") from None
     config = model.config
     try:
         recipe = get_recipe(model)

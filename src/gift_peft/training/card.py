@@ -20,11 +20,12 @@ PACKAGES = ("gift-peft", "torch", "transformers", "peft", "accelerate", "dataset
 # And all that a resumed run may not change.
 RECORDED = ("model_revision", "dataset_name", "num_train_epochs", "max_steps", "retain")
 METRICS = {"mae": "MAE", "abs_rel": "AbsRel", "rmse": "RMSE", "delta1": "delta1 (%)"}
-# Checked on the Hub; only the small one may be used commercially.
+# As the models' pages state them: only the small one may be used commercially.
 LICENSES = {
     "depth-anything/Depth-Anything-V2-Small-hf": "apache-2.0",
     "depth-anything/Depth-Anything-V2-Base-hf": "cc-by-nc-4.0",
     "depth-anything/Depth-Anything-V2-Large-hf": "cc-by-nc-4.0",
+    "facebook/VGGT-1B": "cc-by-nc-4.0",
 }
 
 

@@ -439,3 +439,21 @@ def test_where_proxies_are_kept(tmp_path, monkeypatch):
     assert default_proxies_dir(tmp_path / "a", "net").parent == cached
     (tmp_path / "a/proxies/net").mkdir(parents=True)
     assert default_proxies_dir(tmp_path / "a", "net") == tmp_path / "a" / "proxies"
+
+
+def test_two_runs_may_make_the_same_proxies(tmp_path, monkeypatch):
+    header = {"format": "test"}
+    proxies = torch.ones(2, 4, 4)
+    write_proxies(tmp_path / "a.safetensors", header, proxies, None)
+    other = tmp_path / ".a.b.123.partial"  # of the group a.b, still being written
+    other.touch()
+
+    def taken_away(source, target):
+        os.unlink(source)
+        raise FileNotFoundError(source)
+
+    monkeypatch.setattr("gift_peft.data.proxies.os.replace", taken_away)
+    write_proxies(tmp_path / "a.safetensors", header, proxies, None)  # the other run's file is the same
+    with pytest.raises(FileNotFoundError):
+        write_proxies(tmp_path / "new.safetensors", header, proxies, None)
+    assert other.exists()

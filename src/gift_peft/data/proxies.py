@@ -106,9 +106,14 @@ def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: to
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(partial, path)
+    try:
+        os.replace(partial, path)
+    except FileNotFoundError:  # another run made the same proxies at the same time and tidied up below
+        if not path.exists():
+            raise
     for leftover in path.parent.glob(f".{path.stem}.*.partial"):
-        leftover.unlink(missing_ok=True)
+        if leftover.name.removeprefix(f".{path.stem}.").removesuffix(".partial").isdigit():  # not of a group "a.b"
+            leftover.unlink(missing_ok=True)
 
 
 def make_header(teacher: str, revision: str, size: tuple[int, int], settings: dict) -> dict:

@@ -92,6 +92,11 @@ def _copy_embedded(name: str, destination: Path) -> None:
     os.replace(temporary, destination)
 
 
+def _scored(report: GiftIReport, kind: str) -> list[dict]:
+    """The rows of one kind of target that have metrics."""
+    return [row for row in report.rows if row["group_id"].startswith(kind) and not row["skipped"]]
+
+
 def _panels(groups, report: GiftIReport, loaded) -> list:
     """For each kind of target the observation on which the base errs most inside it: the worst hallucination."""
     rows = {
@@ -99,7 +104,7 @@ def _panels(groups, report: GiftIReport, loaded) -> list:
     }
     panels = []
     for kind, label in KINDS.items():
-        own = [row for row in report.rows if row["group_id"].startswith(kind) and not row["skipped"]]
+        own = _scored(report, kind)
         worst = max(own, key=lambda row: row["base"]["tom"]["rmse"])
         index, names = rows[worst["group_id"]]
         panels.append(
@@ -120,7 +125,7 @@ def _by_kind(report: GiftIReport) -> list[tuple[str, float, float]]:
     """(kind, base, adapted): mean RMSE inside the target per kind of target."""
     lines = []
     for kind, label in KINDS.items():
-        own = [row for row in report.rows if row["group_id"].startswith(kind) and not row["skipped"]]
+        own = _scored(report, kind)
         base, adapted = (sum(row[model]["tom"]["rmse"] for row in own) / len(own) for model in ("base", "adapted"))
         lines.append((label, base, adapted))
     return lines

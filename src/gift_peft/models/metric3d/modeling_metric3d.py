@@ -23,6 +23,8 @@ from .configuration_metric3d import VARIANTS, Metric3DConfig
 from .decoder_metric3d import Metric3DDecoder, Metric3DDecoderOutput
 from .encoder_metric3d import Metric3DEncoder, Metric3DLayerScale
 
+ALIGNMENT = 64  # bytes, of memory that torch allocates on the CPU
+
 
 @dataclass
 class Metric3DDepthEstimatorOutput(DepthEstimatorOutput):
@@ -80,6 +82,20 @@ class Metric3DForDepthEstimation(PreTrainedModel):
         super().__init__(config)
         self.depth_model = Metric3DDensePrediction(config)
         self.post_init()
+
+    @classmethod
+    def from_pretrained(cls, *args: Any, **kwargs: Any) -> Any:
+        """As [`PreTrainedModel.from_pretrained`]; the loaded model computes the same bits as the one that was saved.
+
+        Loaded weights are views into a file, at any address, and some CPU kernels (a product with a single row) add up
+        in an order that depends on it. Here they get the alignment that a fresh tensor has.
+        """
+        loaded = super().from_pretrained(*args, **kwargs)
+        model = loaded[0] if isinstance(loaded, tuple) else loaded  # with output_loading_info=True
+        for parameter in model.parameters():
+            if parameter.device.type == "cpu" and parameter.data_ptr() % ALIGNMENT:
+                parameter.data = parameter.data.clone()
+        return loaded
 
     @classmethod
     def from_official(

@@ -26,6 +26,7 @@ from .head_vggt import VggtDepthHead
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
+ALIGNMENT = 64  # bytes, of memory that torch allocates on the CPU
 VIT_NORM_EPS = 1e-6  # the image transformer's; every other LayerNorm of VGGT has torch's 1e-5
 
 
@@ -266,6 +267,20 @@ class VggtForDepthEstimation(PreTrainedModel):
         self.aggregator = VggtAggregator(config)
         self.depth_head = VggtDepthHead(config)
         self.post_init()
+
+    @classmethod
+    def from_pretrained(cls, *args: Any, **kwargs: Any) -> Any:
+        """As [`PreTrainedModel.from_pretrained`]; the loaded model computes the same bits as the one that was saved.
+
+        Loaded weights are views into a file, at any address, and some CPU kernels (a product with a single row) add up
+        in an order that depends on it. Here they get the alignment that a fresh tensor has.
+        """
+        loaded = super().from_pretrained(*args, **kwargs)
+        model = loaded[0] if isinstance(loaded, tuple) else loaded  # with output_loading_info=True
+        for parameter in model.parameters():
+            if parameter.device.type == "cpu" and parameter.data_ptr() % ALIGNMENT:
+                parameter.data = parameter.data.clone()
+        return loaded
 
     @classmethod
     def from_official(

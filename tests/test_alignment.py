@@ -6,9 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gift_peft.evaluation.alignment import DegenerateFitError, align
+from gift_peft.evaluation.alignment import align
+from gift_peft.evaluation.fitting import DegenerateFitError
 from gift_peft.evaluation.metrics import depth_metrics
-from gift_peft.evaluation.protocols import PROTOCOLS, Protocol, get_protocol
+from gift_peft.evaluation.protocols import PROTOCOLS, Protocol, get_protocol, list_protocols
 
 SHAPE = (7, 9)
 ALL = np.ones(SHAPE, bool)
@@ -195,14 +196,23 @@ def test_wrong_arguments():
 
 
 def test_protocols_state_their_choices():
-    assert list(PROTOCOLS)[:2] == ["gift", "native"]
+    assert list(PROTOCOLS) == ["gift", "native", "gift-literal", "depth4tom", "ntire25", "moge-affine", "metric"]
+    listed = list_protocols()
     for name, protocol in PROTOCOLS.items():
-        assert protocol.name == name and protocol.source and protocol.describe().startswith(f"{name}: ")
+        assert protocol.name == name and protocol.source in listed and f"{name}: " in listed
+        assert protocol.describe() in listed
     assert "clip 1..10000 mm" in PROTOCOLS["gift"].describe()
     assert "no clipping" in PROTOCOLS["native"].describe()
-    for wrong in ({"space": "depth"}, {"dof": "median"}, {"loss": "l1"}, {"resolution": 0.25}):
+    assert "no alignment" in PROTOCOLS["metric"].describe() and "l2" not in PROTOCOLS["metric"].describe()
+    assert "negative inverse depth is near" in PROTOCOLS["depth4tom"].describe()
+    for wrong in ({"space": "both"}, {"dof": "gain"}, {"loss": "l1"}, {"aggregation": "scene"}, {"floor": "min"}):
         with pytest.raises(ValueError, match=f"protocol 'mine': {next(iter(wrong))} .*; what is computed is"):
-            Protocol("mine", **{"space": "auto"} | wrong)
+            Protocol("mine", **{"space": "depth"} | wrong)
+    for space in ("auto", "inverse"):
+        with pytest.raises(ValueError, match="inverting may give an infinite depth"):
+            Protocol("mine", space=space)
+    with pytest.raises(ValueError, match="the lower end comes first"):
+        Protocol("mine", space="auto", clip=(10.0, 1.0))
     mine = Protocol("mine", space="auto", clip=(1.0, 2000.0))
     assert get_protocol(mine) is mine and mine.to_dict()["clip"] == [1.0, 2000.0]
     assert align(scene(1) / 5, scene(1), ALL, mine).aligned.max() == 2000

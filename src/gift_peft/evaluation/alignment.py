@@ -2,20 +2,18 @@
 
     (s*, t*) = argmin sum over valid pixels of (s d + t - y)^2        (GIFT paper, affine-aligned evaluation)
 
-in closed form: float64, centred data. Disparity is fitted to 1/y where the protocol's space is `auto`, never to y.
+in float64. Disparity is fitted to 1/y, never to y, unless the protocol says so; then a warning tells.
 """
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
+from gift_peft.evaluation.fitting import fit, nearest_to_grid
 from gift_peft.evaluation.protocols import KINDS, Protocol, get_protocol
-
-
-class DegenerateFitError(ValueError):
-    """Fewer than two distinct values to fit: no scale and shift exist."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class Alignment:
         scale, shift (`float` or (B,) array): of the fit, so `scale * prediction + shift` is in the fitted space.
         num_clipped (`int` or (B,) array): pixels of the whole picture that the protocol's range changed.
         num_nonpositive (`int` or (B,) array): pixels of the whole picture that were <= 0 after scale and shift,
-            before inversion and clipping.
+            before inversion and clipping (or had no inverse to be fitted).
     """
 
     aligned: Any
@@ -66,25 +64,6 @@ def check_mask(name: str, mask: Any) -> np.ndarray:
     return to_numpy(mask, bool)
 
 
-def fit_scale_shift(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
-    """Least-squares scale and shift of two flat float64 arrays.
-
-    Raises:
-        DegenerateFitError: fewer than two distinct predictions.
-    """
-    spread = float(np.ptp(prediction)) if prediction.size else 0.0
-    if spread < np.finfo(np.float64).tiny / np.finfo(np.float64).eps:  # equal up to subnormal noise
-        raise DegenerateFitError(
-            f"cannot fit scale and shift: the prediction has fewer than two distinct values "
-            f"in the {prediction.size} pixels of the fit"
-        )
-    # Centred and divided by the spread, so that the normal equations lose no digits to a large offset or tiny units.
-    mean, target_mean = prediction.mean(), target.mean()
-    centred = (prediction - mean) / spread
-    scale = float(centred @ (target - target_mean) / (centred @ centred)) / spread
-    return scale, float(target_mean - scale * mean)
-
-
 def align(
     prediction: Any, reference: Any, valid: Any, protocol: str | Protocol = "gift", kind: str = "depth"
 ) -> Alignment:
@@ -92,18 +71,22 @@ def align(
 
     Args:
         prediction (`np.ndarray` or `torch.Tensor`): (H,W) or (B,H,W) in the model's native units; finite everywhere.
-        reference: same shape; depth, in mm for `gift` (whose clip range is in mm); anything in `native`.
-        valid: same shape, bool: the pixels of the fit. Those without a finite reference > 0 are left out.
+        reference: same shape; depth, in mm where the protocol clips (its range is in mm); anything in `native`.
+        valid: same shape, bool: the pixels of the fit (so it is the caller who leaves out the target, where the
+            protocol's `fit_region` is `other`). Those without a finite reference > 0 are left out.
         protocol (`str` or `Protocol`): see `PROTOCOLS`.
         kind (`str`): what the prediction is, `depth` or `inverse_depth`.
 
     Raises:
-        ValueError: unknown protocol or kind, disagreeing shapes, a mask that is not bool, a non-finite prediction.
+        ValueError: unknown protocol or kind, disagreeing shapes, a mask that is not bool, a non-finite prediction,
+            inverse depth under a protocol that compares depth and fits nothing.
         DegenerateFitError: (a ValueError) fewer than two distinct predictions in the fit.
     """
     rules = get_protocol(protocol)
     if kind not in KINDS:
         raise ValueError(f"unknown kind {kind!r}: choose one of {', '.join(KINDS)}")
+    if rules.space == "depth" and rules.dof == "none" and kind == "inverse_depth":
+        raise ValueError(f"protocol {rules.name} fits nothing, so it compares depth with depth; this is inverse depth")
     predictions, references = to_numpy(prediction, np.float64), to_numpy(reference, np.float64)
     valids = check_mask("valid", valid)
     check_shapes(prediction=predictions, reference=references, valid=valids)
@@ -122,22 +105,57 @@ def align(
 def _align_image(
     prediction, reference, valid, rules: Protocol, kind: str
 ) -> tuple[np.ndarray, float, float, int, int]:
-    fit = valid & known(reference)
-    invert = rules.space == "auto" and kind == "inverse_depth"
-    target = 1 / reference[fit] if invert else reference[fit]
-    scale, shift = fit_scale_shift(prediction[fit], target)
+    usable = valid & known(reference)
+    inverts, given_depth = rules.inverts(kind), kind == "depth"
+    if inverts and given_depth:
+        # A depth of zero or less has no inverse: it stays out of the fit and ends up at the near end.
+        positive = prediction > 0
+        usable &= positive
+        prediction = np.divide(1, prediction, out=np.zeros(prediction.shape), where=positive)
+    farthest = reference[usable].max() if rules.floor == "ref_max" and inverts and usable.any() else None
+    loss = rules.loss_for(kind)
+    pixels = nearest_to_grid(usable) if loss == "l1_rel" else usable
+    target = reference[pixels]
+    scale, shift = fit(prediction[pixels], 1 / target if inverts else target, rules.dof, loss)
+    if rules.space == "depth":
+        _tell_fit_to_depth(rules, kind, scale)
     aligned = scale * prediction + shift
+    if inverts and given_depth:
+        aligned[~positive] = np.inf
     num_nonpositive = int(np.count_nonzero(aligned <= 0))
-    if invert:
-        # A disparity of zero or less is beyond infinity: far, not a negative depth.
-        with np.errstate(divide="ignore", over="ignore"):
-            aligned = np.where(aligned > 0, 1 / aligned, np.inf)
     num_clipped = 0
+    if inverts:
+        if given_depth:
+            num_nonpositive += int(np.count_nonzero(~positive))
+        if farthest is not None:
+            low = aligned < 1 / farthest
+            num_clipped += int(np.count_nonzero(low))
+            aligned[low] = 1 / farthest
+        _invert(aligned, rules.nonpositive)
     if rules.clip is not None:
         inside = np.clip(aligned, *rules.clip)
-        num_clipped = int(np.count_nonzero(inside != aligned))
+        num_clipped += int(np.count_nonzero(inside != aligned))
         aligned = inside
     return aligned, scale, shift, num_clipped, num_nonpositive
+
+
+def _invert(values: np.ndarray, nonpositive: str) -> None:
+    """Inverse depth to depth, in place; zero is infinitely far, and what is below it is far or near."""
+    below = values < 0
+    with np.errstate(divide="ignore", over="ignore"):
+        np.divide(1, np.abs(values, out=values), out=values)
+    values[below] = np.inf if nonpositive == "far" else -np.inf
+
+
+def _tell_fit_to_depth(rules: Protocol, kind: str, scale: float) -> None:
+    """A fit of disparity to depth is what some protocols say, but never goes unsaid."""
+    if kind == "inverse_depth":
+        warnings.warn(f"protocol {rules.name} fits inverse depth straight to depth, not to its inverse", stacklevel=4)
+    elif scale < 0:
+        warnings.warn(
+            f"protocol {rules.name}: the fitted scale is negative, as if the prediction were inverse depth",
+            stacklevel=4,
+        )
 
 
 def known(reference: np.ndarray) -> np.ndarray:

@@ -1,20 +1,31 @@
 """Named sets of evaluation choices: a depth error means nothing without the way it was aligned and averaged.
 
 Every table prints the protocol it was made with. `gift` is the paper's affine-aligned evaluation (Experiments,
-"Metrics and affine-aligned evaluation"); `native` is the same fit inside the teacher's own output space.
+"Metrics and affine-aligned evaluation"); `native` is the same fit inside the teacher's own output space; the others are
+what published evaluators do, so that numbers can be compared with theirs.
 """
 
 from dataclasses import asdict, dataclass
 
 KINDS = ("depth", "inverse_depth")
 # A choice that nothing computes must not stand under a table.
-IMPLEMENTED = {
-    "space": ("auto", "native"),
-    "dof": ("scale_shift",),
-    "loss": ("l2",),
-    "fit_region": ("valid",),
-    "aggregation": ("image",),
-    "resolution": (1.0,),
+CHOICES = {
+    "space": ("auto", "depth", "inverse", "native"),
+    "dof": ("scale_shift", "scale", "shift", "median", "none"),
+    "loss": ("l2", "l1_rel", "huber"),
+    "inverse_loss": (None, "l2", "l1_rel", "huber"),
+    "fit_region": ("valid", "other"),
+    "floor": (None, "ref_max"),
+    "nonpositive": ("far", "near"),
+    "aggregation": ("image", "pixel", "group"),
+    "expects": (None, *KINDS),
+}
+FITS = {
+    "scale_shift": "scale and shift",
+    "scale": "scale alone",
+    "shift": "shift alone",
+    "median": "scale of the medians",
+    "none": "no alignment",
 }
 
 
@@ -25,63 +36,144 @@ class Protocol:
     Args:
         name (`str`): key in `PROTOCOLS`.
         space (`str`): where the fit happens. `auto`: where the prediction lives, so an inverse-depth prediction is
-            fitted to 1/reference and inverted. `native`: prediction and reference share a space, nothing is inverted.
-        dof (`str`): what is fitted: `scale_shift`.
-        loss (`str`): the fit's loss: `l2`, in closed form.
-        fit_region (`str`): `valid`: all valid pixels, target and surroundings alike.
+            fitted to 1/reference and inverted. `depth`: depth, whatever the prediction is. `inverse`: 1/reference; a
+            depth prediction is inverted first. `native`: prediction and reference share a space, nothing is inverted.
+        dof (`str`): what is fitted: `scale_shift`, `scale`, `shift`, `median` (scale = median(y) / median(d)), `none`.
+        loss (`str`): the fit's loss. `l2`: least squares, in closed form. `l1_rel`: sum |s d + t - y| / y, exactly, on
+            the valid pixels nearest to the centres of a 64x64 grid. `huber`: threshold 1.345 robust standard
+            deviations of the least-squares residuals. Of no meaning to `median` and `none`.
+        inverse_loss (`str`, *optional*): the loss where the fit is in inverse depth; default `loss`.
+        fit_region (`str`): `valid`: all valid pixels, target and surroundings alike; `other`: without the target.
         clip (`tuple[float, float]`, *optional*): working range in the reference's unit, applied after alignment and
-            inversion. A non-positive aligned disparity means "far" and takes the upper end.
-        aggregation (`str`): `image`: the mean over images of each image's own metric.
-        resolution (`float`): metrics are taken on the reference's grid times this factor.
+            inversion.
+        floor (`str`, *optional*): `ref_max`: an aligned inverse depth is raised to that of the farthest reference.
+        nonpositive (`str`): what an aligned inverse depth below 0 means: `far`, the upper end of `clip`, or `near`,
+            the lower one. (0 is infinitely far in both.)
+        aggregation (`str`): `image`: the mean over images of each image's own metric; `pixel`: over all pixels
+            together; `group`: the mean over groups (scenes) of the group's image mean.
+        resolution (`float`, *optional*): metrics are taken on the reference's grid times this factor; None leaves it
+            to the evaluation, whose report states it.
         unit (`str`): unit of the reference that `clip` is meant for, `mm` or `native`.
+        expects (`str`, *optional*): what the published evaluator takes stored predictions for, where nobody says.
         source (`str`): where the choices come from.
+
+    Raises:
+        ValueError: a choice that is not one, or an inversion without `clip` or `floor`, whose depth could be infinite.
     """
 
     name: str
     space: str
     dof: str = "scale_shift"
     loss: str = "l2"
+    inverse_loss: str | None = None
     fit_region: str = "valid"
     clip: tuple[float, float] | None = None
+    floor: str | None = None
+    nonpositive: str = "far"
     aggregation: str = "image"
-    resolution: float = 1.0
+    resolution: float | None = None
     unit: str = "mm"
+    expects: str | None = None
     source: str = ""
 
     def __post_init__(self) -> None:
-        for name, choices in IMPLEMENTED.items():
+        for name, choices in CHOICES.items():
             value = getattr(self, name)
             if value not in choices:
                 known = ", ".join(map(str, choices))
                 raise ValueError(f"protocol {self.name!r}: {name} {value!r}; what is computed is {known}")
+        if self.clip is not None and not self.clip[0] < self.clip[1]:
+            raise ValueError(f"protocol {self.name!r}: clip {self.clip}; the lower end comes first")
+        if self.clip is None and self.floor is None and self.space in ("auto", "inverse"):
+            raise ValueError(
+                f"protocol {self.name!r}: inverting may give an infinite depth; name a clip range or floor='ref_max'"
+            )
+
+    def inverts(self, kind: str) -> bool:
+        """Whether a prediction of this kind is aligned in inverse depth."""
+        return self.space == "inverse" or (self.space == "auto" and kind == "inverse_depth")
+
+    def loss_for(self, kind: str) -> str:
+        """The loss of the fit for a prediction of this kind."""
+        return (self.inverse_loss or self.loss) if self.inverts(kind) else self.loss
 
     def describe(self) -> str:
         """One line with every choice, as it stands under a table."""
+        fit = FITS[self.dof]
+        if self.dof not in ("median", "none"):
+            other = f" ({self.inverse_loss} in inverse depth)" if self.inverse_loss else ""
+            fit = f"{fit} by {self.loss}{other}"
+        over = "" if self.dof == "none" else f" over {self.fit_region} pixels"
         clip = "no clipping" if self.clip is None else f"clip {self.clip[0]:g}..{self.clip[1]:g} {self.unit}"
-        return (
-            f"{self.name}: {self.dof} by {self.loss} over {self.fit_region} pixels, space {self.space}, {clip}, "
-            f"{self.aggregation} mean, resolution x{self.resolution:g}"
-        )
+        parts = [f"{self.name}: {fit}{over}", f"space {self.space}", clip]
+        if self.floor:
+            parts.append("inverse depth at least that of the farthest reference")
+        if self.nonpositive == "near":
+            parts.append("negative inverse depth is near")
+        parts.append(f"{self.aggregation} mean")
+        if self.resolution is not None:
+            parts.append(f"resolution x{self.resolution:g}")
+        return ", ".join(parts)
 
     def to_dict(self) -> dict:
         """The choices as JSON types."""
         return asdict(self) | {"clip": None if self.clip is None else list(self.clip)}
 
 
-PROTOCOLS = {
-    "gift": Protocol(
+WORKING_RANGE = (1.0, 10000.0)  # mm: Booster's evaluators drop ground truth outside of it
+_PRESETS = (
+    Protocol(
         "gift",
         space="auto",
-        clip=(1.0, 10000.0),
+        clip=WORKING_RANGE,
         source="GIFT paper, Experiments: affine alignment on all valid pixels; Booster ground truth in mm",
     ),
-    "native": Protocol(
+    Protocol(
         "native",
         space="native",
         unit="native",
         source="GIFT paper, Experiments: proxies of the frozen teacher, in proxy units",
     ),
-}
+    Protocol(
+        "gift-literal",
+        space="depth",
+        clip=WORKING_RANGE,
+        source="GIFT paper, the alignment equation to the letter: (s d + t - y)^2 with y depth, whatever d is",
+    ),
+    Protocol(
+        "depth4tom",
+        space="inverse",
+        clip=WORKING_RANGE,
+        nonpositive="near",
+        resolution=0.25,
+        expects="inverse_depth",
+        source="Costanzino et al., ICCV 2023, evaluate_mono.py of CVLAB-Unibo/Depth4ToM-code (least squares)",
+    ),
+    Protocol(
+        "ntire25",
+        space="depth",
+        clip=WORKING_RANGE,
+        resolution=1.0,
+        source="NTIRE 2025 challenge on HR depth from images of specular and transparent surfaces, mono track: scale "
+        "and shift first, evaluated in the depth domain at full resolution (working range: ours)",
+    ),
+    Protocol(
+        "moge-affine",
+        space="auto",
+        loss="l1_rel",
+        inverse_loss="l2",
+        floor="ref_max",
+        source="MoGe, moge/test/metrics.py: depth_affine_invariant, disparity_affine_invariant",
+    ),
+    Protocol(
+        "metric",
+        space="depth",
+        dof="none",
+        clip=WORKING_RANGE,
+        source="NTIRE 2026 and Depth Pro on Booster: metric depth, nothing fitted",
+    ),
+)
+PROTOCOLS = {protocol.name: protocol for protocol in _PRESETS}
 
 
 def get_protocol(protocol: str | Protocol) -> Protocol:
@@ -91,3 +183,8 @@ def get_protocol(protocol: str | Protocol) -> Protocol:
     if protocol not in PROTOCOLS:
         raise ValueError(f"unknown protocol {protocol!r}: choose one of {', '.join(PROTOCOLS)}")
     return PROTOCOLS[protocol]
+
+
+def list_protocols() -> str:
+    """Every preset's choices and source, for `gift-peft evaluate --list-protocols`."""
+    return "\n".join(f"{protocol.describe()}\n    {protocol.source}" for protocol in PROTOCOLS.values())

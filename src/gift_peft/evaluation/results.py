@@ -1,6 +1,6 @@
 """What an evaluation leaves behind: per-image rows, their means per region, GCE, the collapse alarm, and the files.
 
-Summaries are means over images (NaN left out and counted), so they do not depend on the order of the rows.
+Summaries are means over images, pixels or groups (NaN left out and counted) that do not depend on the order of the rows.
 """
 
 import json
@@ -19,8 +19,50 @@ REGIONS = ("tom", "other", "all")
 COLLAPSE_RANGE = (0.5, 2.0)
 
 
+class Report:
+    """What the reports have in common: their files. Subclasses are dataclasses with a field `rows`."""
+
+    rows: list[dict]
+
+    def to_dict(self) -> dict:
+        """Everything but the rows, in JSON types; NaN and infinity become None."""
+        return jsonable({item.name: getattr(self, item.name) for item in fields(self) if item.name != "rows"})
+
+    def save(self, folder: str | Path) -> Path:
+        """Writes `metrics.json` and `rows.jsonl`, each at once or not at all; returns the folder."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(folder / "rows.jsonl", "".join(json.dumps(jsonable(row)) + "\n" for row in self.rows))
+        write_text(folder / "metrics.json", json.dumps(self.to_dict(), indent=2) + "\n")
+        return folder
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "Report":
+        """A saved report; FileNotFoundError if the folder holds none, ValueError if it is one of another dataset."""
+        folder = Path(folder)
+        for name in ("metrics.json", "rows.jsonl"):
+            if not (folder / name).is_file():
+                raise FileNotFoundError(f"no evaluation in {folder}: {name} is missing; run gift-peft evaluate --out")
+        rows = [json.loads(line) for line in (folder / "rows.jsonl").read_text(encoding="utf-8").splitlines()]
+        values = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        known = {item.name for item in fields(cls)} - {"rows"}
+        if unknown := values.keys() - known:
+            raise ValueError(f"{folder}/metrics.json is no {cls.__name__}: it has {', '.join(sorted(unknown))}")
+        return cls(rows=rows, **values)
+
+
+def load_report(folder: str | Path) -> "GiftIReport | BoosterReport":
+    """The report that `gift-peft evaluate --out` left in a folder, of either dataset.
+
+    Raises FileNotFoundError or ValueError where there is none.
+    """
+    path = Path(folder) / "metrics.json"
+    booster = path.is_file() and "illumination_gce" in json.loads(path.read_text(encoding="utf-8"))
+    return (BoosterReport if booster else GiftIReport).load(folder)
+
+
 @dataclass
-class GiftIReport:
+class GiftIReport(Report):
     """The result of `evaluate_gift_i`.
 
     Args:
@@ -57,27 +99,41 @@ class GiftIReport:
     rows: list[dict] = field(repr=False)
     about: dict = field(default_factory=dict)
 
-    def to_dict(self) -> dict:
-        """Everything but the rows, in JSON types; NaN and infinity become None."""
-        return jsonable({item.name: getattr(self, item.name) for item in fields(self) if item.name != "rows"})
 
-    def save(self, folder: str | Path) -> Path:
-        """Writes `metrics.json` and `rows.jsonl`, each at once or not at all; returns the folder."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / "rows.jsonl", "".join(json.dumps(jsonable(row)) + "\n" for row in self.rows))
-        write_text(folder / "metrics.json", json.dumps(self.to_dict(), indent=2) + "\n")
-        return folder
+@dataclass
+class BoosterReport(Report):
+    """The result of `evaluate_booster`; MAE and RMSE in mm. Groups are scenes: one pose and geometry, several lights.
 
-    @classmethod
-    def load(cls, folder: str | Path) -> "GiftIReport":
-        """A saved report; FileNotFoundError if the folder holds none."""
-        folder = Path(folder)
-        for name in ("metrics.json", "rows.jsonl"):
-            if not (folder / name).is_file():
-                raise FileNotFoundError(f"no evaluation in {folder}: {name} is missing; run gift-peft evaluate --out")
-        rows = [json.loads(line) for line in (folder / "rows.jsonl").read_text(encoding="utf-8").splitlines()]
-        return cls(rows=rows, **json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
+    Args:
+        summary (`dict`): {region: {metric: mean as the protocol aggregates}} of the evaluated model or predictions.
+        base (`dict`, *optional*): the same of the frozen model; equal to `summary` where that is what was evaluated.
+        illumination_gce (`dict`): Eq. 7 over a scene's images inside ToM, in native units: how much a prediction
+            changes with the light alone. Not GIFT-I's GCE, whose reflected content changes. `base`, `adapted`,
+            `base_normalized`, `adapted_normalized` (None where that model was not run), `num_groups`, `num_skipped`.
+        collapse (`dict`, *optional*): adapted/base ratios `target_mean_ratio` and `spread_ratio`, and `alarm`.
+        per_scene (`dict`): {scene: {`num_images`, `num_scored`, `summary`, `base`}}.
+        counts (`dict`): `groups` (scenes), `images`, `scored`, `skipped`, `reasons` ({reason: images}), and
+            `without_tom`, `without_other`: scored images that have no known pixel in that region.
+        protocol (`dict`): the protocol's choices at the resolution used; `description` is the line under every table.
+        adapted (`bool`): whether `summary` is of an adapted model.
+        groups (`list[dict]`): illumination GCE per scene.
+        rows (`list[dict]`): one per image, see `evaluate_booster`.
+        about (`dict`): `dataset`, `root`, `subset`, `resize`, `occlusion`, `tom_classes`, `kind`, `official` and, where
+            the caller knows, `base`, `adapter`, `predictions`.
+    """
+
+    summary: dict
+    base: dict | None
+    illumination_gce: dict
+    collapse: dict | None
+    per_scene: dict
+    counts: dict
+    protocol: dict
+    adapted: bool
+    unit: str
+    groups: list[dict]
+    rows: list[dict] = field(repr=False)
+    about: dict = field(default_factory=dict)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -104,12 +160,32 @@ def mean(values: list[float]) -> float:
     return math.fsum(values) / len(values) if values else math.nan
 
 
-def summarize(rows: list[dict], model: str) -> dict:
-    """{region: {metric: mean over images}} of one of `base`, `adapted`, `consensus`."""
-    return {
-        region: {metric: mean([row[model][region][metric] for row in rows]) for metric in METRICS}
-        for region in REGIONS
-    }
+def summarize(rows: list[dict], model: str, aggregation: str = "image") -> dict:
+    """{region: {metric: mean}} of one of `base`, `adapted`, `consensus`, over images, pixels or groups."""
+    if aggregation == "group":
+        groups = [
+            summarize([row for row in rows if row["group_id"] == group_id], model)
+            for group_id in dict.fromkeys(row["group_id"] for row in rows)
+        ]
+        return {region: {m: mean([group[region][m] for group in groups]) for m in METRICS} for region in REGIONS}
+    average = pooled_mean if aggregation == "pixel" else image_mean
+    return {region: {metric: average(rows, model, region, metric) for metric in METRICS} for region in REGIONS}
+
+
+def image_mean(rows: list[dict], model: str, region: str, metric: str) -> float:
+    """The mean over images of each image's own metric."""
+    return mean([row[model][region][metric] for row in rows])
+
+
+def pooled_mean(rows: list[dict], model: str, region: str, metric: str) -> float:
+    """The metric of all the rows' known pixels of the region (`pixels`) taken together, from the images' own."""
+    known = [(row[model][region][metric], row["pixels"][region]) for row in rows]
+    known = [(value, pixels) for value, pixels in known if not math.isnan(value)]
+    if not known:
+        return math.nan
+    power = 2 if metric == "rmse" else 1  # a root does not average, its square does
+    total = math.fsum(pixels * value**power for value, pixels in known)
+    return (total / sum(pixels for _, pixels in known)) ** (1 / power)
 
 
 def summarize_gce(groups: list[dict], models: list[str]) -> dict:
@@ -165,13 +241,13 @@ def count_scored(rows: list[dict], subject: str, region: str) -> int:
     return sum(not row["skipped"] and not math.isnan(row[subject][region]["mae"]) for row in rows)
 
 
-def by_surface(rows: list[dict], models: list[str], subject: str) -> dict:
+def by_surface(rows: list[dict], models: list[str], subject: str, aggregation: str = "image") -> dict:
     """The summaries per surface kind, `unknown` where the group states none."""
     surfaces = sorted({row["surface"] or "unknown" for row in rows})
     result = {}
     for surface in surfaces:
         own = [row for row in rows if (row["surface"] or "unknown") == surface]
-        result[surface] = {"num_images": count_scored(own, subject, "tom"), "summary": summarize(own, subject)}
+        result[surface] = {"num_images": count_scored(own, subject, "tom"), "summary": summarize(own, subject, aggregation)}
         for model in ("base", "consensus"):
-            result[surface][model] = summarize(own, model) if model in models else None
+            result[surface][model] = summarize(own, model, aggregation) if model in models else None
     return result

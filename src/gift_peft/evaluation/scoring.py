@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from gift_peft.data.preprocess import Group, to_mask
-from gift_peft.evaluation.alignment import DegenerateFitError, align, known
+from gift_peft.evaluation.alignment import align, known
+from gift_peft.evaluation.fitting import DegenerateFitError
 from gift_peft.evaluation.metrics import METRICS, depth_metrics
 from gift_peft.evaluation.protocols import Protocol
 from gift_peft.evaluation.results import REGIONS

@@ -7,7 +7,6 @@ rotations are complex products, resizing is a matrix per axis. Slow, and meant t
 import math
 
 import torch
-from torch import nn
 from torch.nn.functional import conv2d, conv_transpose2d, pad
 
 # ---- pieces that both have ----
@@ -252,7 +251,7 @@ def _vggt_head(w, c, tokens, grid, image, count):
 
 
 def metric3d(w, config, images):
-    """Per image a list over the iterations, initial state first: (depth (H, W), confidence (H, W), normals (4, H, W))."""
+    """Per image a list, initial state first, of (depth (H, W), confidence (H, W), normals (4, H, W))."""
     w = {name.removeprefix("depth_model."): value for name, value in w.items()}
     return [_metric3d_image(w, config, image) for image in images]
 
@@ -392,19 +391,3 @@ def _metric3d_tokens(w, c, image, grid):
         if c.variant == "giant2" and (index + 1) in [c.depth * k // 4 for k in (1, 2, 3, 4)]:
             features.append(x)
     return features or [layer_norm(w, "encoder.norm", x, c.vit_layer_norm_eps)] * 4
-
-
-def randomize(model: nn.Module, seed: int = 0) -> nn.Module:
-    """Random weights everywhere, of fan-in scale, so that outputs depend on every one of them."""
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for name, weight in model.named_parameters():
-            noise = torch.randn(weight.shape, generator=generator, dtype=weight.dtype)
-            last = name.split(".")[-1]
-            if last == "gamma" or ("norm" in name and last == "weight"):
-                weight.copy_(1 + 0.1 * noise)
-            elif weight.ndim > 1 and "token" not in last and "embed" not in last:
-                weight.copy_(noise / weight[0].numel() ** 0.5)
-            else:
-                weight.copy_(0.1 * noise)
-    return model

@@ -1,6 +1,7 @@
 """Official weights to a transformers folder, and what the Auto classes make of it."""
 
-import json
+import ast
+import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from backbones import metric3d_golden, vggt_golden
 from PIL import Image
 from safetensors.torch import load_file, save_file
 from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation, pipeline
@@ -17,11 +19,11 @@ from gift_peft.models.convert import CONVERTERS
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
 from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil
 
-FIXTURES = Path(__file__).parent / "fixtures"
 CLASSES = {
     "vggt": (VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil),
     "metric3d": (Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil),
 }
+INSTALLED_WITH_TRANSFORMERS = {"torch", "numpy", "transformers", "safetensors", "huggingface_hub"}
 OTHER = {"vggt": "metric3d", "metric3d": "vggt"}
 
 
@@ -33,14 +35,10 @@ def registered():
 
 def official(name):
     """(official weights, their config) of the public golden."""
-    tensors = load_file(FIXTURES / name / "golden_public.safetensors")
-    if name == "vggt":
-        weights = {key: value for key, value in tensors.items() if not key.startswith("golden.")}
-    else:
-        weights = {key.removeprefix("weights/"): tensors[key] for key in tensors if key.startswith("weights/")}
-    config = json.loads((FIXTURES / name / "golden_public.json").read_text())["config"]
-    config.pop("seed", None)
-    return weights, CLASSES[name][0](**config)
+    if name == "metric3d":
+        return metric3d_golden()[1:]
+    _, weights, sidecar = vggt_golden()
+    return weights, VggtConfig(**sidecar["config"])
 
 
 @pytest.fixture(scope="module", params=sorted(CLASSES))
@@ -159,6 +157,22 @@ def test_an_unreachable_hub_is_one_line(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no such file, and model\.safetensors of nobody/nothing") as caught:
         convert.convert_vggt("nobody/nothing", tmp_path / "out")  # HF_HUB_OFFLINE is set
     assert "\n" not in str(caught.value) and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", sorted(CLASSES))
+def test_the_files_work_on_their_own(name):
+    """Saved folders carry them: each imports only siblings and packages of a transformers installation."""
+    folder = Path(inspect.getfile(CLASSES[name][1])).parent
+    files = sorted(folder.glob(f"*_{name}.py"))
+    assert len(files) > 3
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level:
+                assert node.level == 1 and folder / f"{node.module}.py" in files
+            elif isinstance(node, (ast.Import, ast.ImportFrom)):
+                names = [node.module] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names]
+                tops = {name.split(".")[0] for name in names}
+                assert tops <= INSTALLED_WITH_TRANSFORMERS | sys.stdlib_module_names, f"{file.name} imports {names}"
 
 
 PROBE = """

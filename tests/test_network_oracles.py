@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from backbones import randomize
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from network_oracles import metric3d, randomize, vggt
+from network_oracles import metric3d, vggt
 
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation
 from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation

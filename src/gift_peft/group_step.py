@@ -1,26 +1,35 @@
 """One group in, its summed gradient out, in the memory of one micro-batch (supplement B, "snapshot and replay").
 
 Forward all images without grad (snapshots), differentiate the group's loss with respect to the snapshots alone, then
-forward each micro-batch again with grad (replay) and push its slice of that gradient through the graph.
+forward each micro-batch again with grad (replay) and push its slice of that gradient through the graph. Micro-batches
+whose graphs fit into memory keep them from the snapshot and are not forwarded again.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from gift_peft.losses import GiftLoss, gift_loss, require_finite
+from gift_peft.retention import GraphBudget, local_processes
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
+Result = TypeVar("Result")
+
 
 class GroupStepOutput(NamedTuple):
-    """Detached values of one group, equal on all processes; `forwards` counts image forwards over all of them."""
+    """Detached values of one group, equal on all processes.
+
+    `forwards` counts image forwards over all of them: 2N - retained, without what is repeated for want of memory.
+    """
 
     total: Tensor
     consistency: Tensor
@@ -38,11 +47,17 @@ class GroupStep:
         lambda_c, lambda_d: weights of consistency and distillation (Eq. 6).
         micro_batch_size: images per forward; the group is cut once, in image order.
         retain: keep the graphs of the last whole micro-batches, at most this many images, instead of replaying them.
-            0 is the paper's schedule; "auto" currently means 0. The gradient does not depend on it.
+            0 is the paper's schedule; "auto" keeps as many as memory allows (see `budget`), and fewer after running
+            out of it. On CPU the gradient does not depend on it, to the bit.
         accelerator: its processes share the micro-batches, and its mixed precision ("no" or "bf16") is used. Without
             one: this process alone, bf16 for a model on CUDA, else no. See the attribute `mixed_precision`.
+        snapshot_micro_batch_size: images per forward of the snapshots that are replayed, a multiple of
+            `micro_batch_size`; default the same. Larger ones keep a fast device busier, but then the snapshots' bits
+            are not those of the replays, and depend on `retain`, which must be a number.
 
-    Raises ValueError for fp16, active dropout settings, a DDP wrapper and arguments out of range.
+    Attributes: `budget`, the `GraphBudget` of "auto", else None; `phase`, called with "snapshot", "loss", "replay" and
+    "reduce" for a context around each part of a step, to time it.
+    Raises ValueError for fp16, active dropout settings, a wrapped or sharded model and arguments out of range.
     """
 
     def __init__(
@@ -53,6 +68,7 @@ class GroupStep:
         micro_batch_size: int = 2,
         retain: int | str = "auto",
         accelerator: Accelerator | None = None,
+        snapshot_micro_batch_size: int | None = None,
     ) -> None:
         if isinstance(micro_batch_size, bool) or not isinstance(micro_batch_size, int) or micro_batch_size < 1:
             raise ValueError(f"micro_batch_size must be a positive integer, got {micro_batch_size!r}")
@@ -60,15 +76,28 @@ class GroupStep:
             raise ValueError(f'retain must be "auto" or a number of images >= 0, got {retain!r}')
         if isinstance(model, nn.parallel.DistributedDataParallel):
             raise ValueError("GroupStep sums gradients itself: pass the model without DistributedDataParallel")
+        if snapshot_micro_batch_size is not None:
+            if snapshot_micro_batch_size < 1 or snapshot_micro_batch_size % micro_batch_size:
+                raise ValueError(
+                    f"snapshot_micro_batch_size must be a multiple of micro_batch_size {micro_batch_size}, "
+                    f"got {snapshot_micro_batch_size}"
+                )
+            if retain == "auto":
+                raise ValueError(
+                    "snapshot_micro_batch_size needs a fixed retain: else results would depend on the memory"
+                )
         self.model = model
         self.lambda_c = lambda_c
         self.lambda_d = lambda_d
         self.micro_batch_size = micro_batch_size
-        self.retain = 0 if retain == "auto" else retain
+        self.snapshot_micro_batch_size = snapshot_micro_batch_size or micro_batch_size
+        self.retain = retain
         self.accelerator = accelerator
         self.mixed_precision = _mixed_precision(model, accelerator)
+        self.phase: Callable[[str], AbstractContextManager] = nullcontext
         self._rank = accelerator.process_index if accelerator else 0
         self._world = accelerator.num_processes if accelerator else 1
+        self.budget = GraphBudget(model, local_processes(self._world)) if retain == "auto" else None
         _check_replayable(model)
 
     def accumulate(
@@ -97,54 +126,97 @@ class GroupStep:
         mask, target = mask.to(device), target.to(device)
         valid = None if valid is None else valid.to(device)
         batches = [slice(i, i + self.micro_batch_size) for i in range(0, len(mask), self.micro_batch_size)]
-        num_retained = self._num_retained(len(mask))
 
         canvas = torch.zeros(mask.shape, dtype=torch.promote_types(parameters[0].dtype, torch.float32), device=device)
-        graphs = self._snapshot(pixel_values, batches, canvas, first_retained=len(mask) - num_retained)
+        graphs: dict[int, Tensor] = {}
+        num_retained = self._snapshot(pixel_values, batches, canvas, graphs)
         require_finite(canvas, "the prediction", names)
-        loss, gradient = self._differentiate(canvas, target, mask, valid)
+        with self.phase("loss"):
+            differentiate = partial(self._differentiate, canvas, target, mask, valid)
+            loss, gradient = self._recovering(differentiate, pixel_values, graphs)
         if not loss.total.isfinite():  # differences of finite predictions overflow; their signs do not
             raise ValueError("the loss of this group is NaN or infinite")
-        self._add_gradients(parameters, lambda: self._replay(pixel_values, batches, gradient, graphs))
+        self._add_gradients(parameters, partial(self._replay, parameters, pixel_values, batches, gradient, graphs))
         return GroupStepOutput(*loss, forwards=2 * len(mask) - num_retained)
 
-    def _num_retained(self, num_images: int) -> int:
-        """Images in the last whole micro-batches that fit into `retain`."""
-        if self.retain >= num_images:
-            return num_images
-        last = num_images % self.micro_batch_size
-        if last > self.retain:
-            return 0
-        return last + (self.retain - last) // self.micro_batch_size * self.micro_batch_size
+    def _snapshot(self, pixel_values: Tensor, batches: list[slice], canvas: Tensor, graphs: dict[int, Tensor]) -> int:
+        """Fill `canvas` (N,H,W) with all predictions, and `graphs` with this process's that kept their graph.
 
-    def _snapshot(
-        self, pixel_values: Tensor, batches: list[slice], canvas: Tensor, first_retained: int
-    ) -> dict[int, Tensor]:
-        """Fill `canvas` (N,H,W) with all predictions; returns this process's predictions that kept their graph."""
-        graphs = {}
+        Returns how many images keep theirs, over all processes.
+        """
         sizes = canvas.new_zeros(len(canvas), 2)  # travels with the canvas, so that all processes raise or none
-        for index in self._mine(batches):
-            batch = batches[index]
-            keep = batch.start >= first_retained
-            with torch.set_grad_enabled(keep):
-                prediction = self._predict(pixel_values[batch])
-            sizes[batch] = sizes.new_tensor(prediction.shape[-2:])
-            if prediction.shape == canvas[batch].shape:
-                canvas[batch] = prediction.detach()
-            if keep:
-                graphs[index] = prediction
+        with self.phase("snapshot"):
+            forward = partial(self._forward, pixel_values, batches, canvas, sizes, graphs)
+            self._recovering(forward, pixel_values, graphs)
+        num_retained = sum(map(len, graphs.values()))
         if self._world > 1:
-            # A sum of zeros and one prediction is that prediction to the bit, NaN included.
-            flat = self.accelerator.reduce(torch.cat([sizes.flatten(), canvas.flatten()]), "sum")
-            sizes = flat[: sizes.numel()].view_as(sizes)
-            canvas.copy_(flat[sizes.numel() :].view_as(canvas))
+            with self.phase("reduce"):
+                # A sum of zeros and one prediction is that prediction to the bit, NaN included.
+                parts = [canvas.new_tensor([num_retained]), sizes.flatten(), canvas.flatten()]
+                summed = self.accelerator.reduce(torch.cat(parts), "sum").split([len(part) for part in parts])
+            num_retained, sizes = int(summed[0]), summed[1].view_as(sizes)
+            canvas.copy_(summed[2].view_as(canvas))
         for height, width in sizes.long().unique(dim=0).tolist():
             if (height, width) != tuple(canvas.shape[-2:]):
                 raise ValueError(
                     f"the prediction is {height}x{width} but mask and target are {canvas.shape[1]}x{canvas.shape[2]}: "
                     "resize them to the prediction's size"
                 )
-        return graphs
+        return num_retained
+
+    def _forward(
+        self,
+        pixel_values: Tensor,
+        batches: list[slice],
+        canvas: Tensor,
+        sizes: Tensor,
+        graphs: dict[int, Tensor],
+    ) -> None:
+        """This process's share of the predictions and their sizes; `graphs` gets those that are retained."""
+
+        def store(batch: slice, prediction: Tensor) -> None:
+            sizes[batch] = sizes.new_tensor(prediction.shape[-2:])
+            if prediction.shape == canvas[batch].shape:
+                canvas[batch] = prediction.detach()
+
+        mine = self._mine(batches)
+        if self.budget is not None and mine and not self.budget.knows(pixel_values):
+            with torch.enable_grad():
+                graphs[mine[0]] = self.budget.measure(pixel_values[batches[mine[0]]], self._predict)
+            store(batches[mine[0]], graphs[mine[0]])
+        kept = self._retained(pixel_values, batches, canvas)
+        done = list(graphs)
+        if not kept or mine[0] != kept[0]:
+            graphs.clear()
+        # Cut as the replays are, or several micro-batches at a time.
+        together = self.snapshot_micro_batch_size // self.micro_batch_size
+        rest = [index for index in mine if index not in kept and index not in done]
+        with torch.no_grad():
+            for chunk in (rest[i : i + together] for i in range(0, len(rest), together)):
+                images = [pixel_values[batches[index]] for index in chunk]
+                predictions = self._predict(images[0] if len(chunk) == 1 else torch.cat(images))
+                for index, part in zip(chunk, predictions.split([len(x) for x in images]), strict=True):
+                    store(batches[index], part)
+        with torch.enable_grad():
+            for index in kept:
+                if index not in graphs:
+                    graphs[index] = self._predict(pixel_values[batches[index]])
+                    store(batches[index], graphs[index])
+
+    def _retained(self, pixel_values: Tensor, batches: list[slice], canvas: Tensor) -> list[int]:
+        """The last of this process's micro-batches that keep their graphs, whole ones only."""
+        mine = self._mine(batches)
+        if self.budget is None:  # so many images of the group
+            candidates, room = range(len(batches)), self.retain
+        else:  # so many images of this process
+            candidates, room = mine, self.budget.images(pixel_values, canvas) if mine else 0
+        first = len(batches)
+        for index in reversed(candidates):
+            room -= len(canvas[batches[index]])
+            if room < 0:
+                break
+            first = index
+        return [index for index in mine if index >= first]
 
     def _differentiate(
         self, canvas: Tensor, target: Tensor, mask: Tensor, valid: Tensor | None
@@ -156,12 +228,43 @@ class GroupStep:
             (gradient,) = torch.autograd.grad(loss.total, leaf)
         return GiftLoss(*(term.detach() for term in loss[:3]), loss.num_pairs), gradient
 
-    def _replay(self, pixel_values: Tensor, batches: list[slice], gradient: Tensor, graphs: dict[int, Tensor]) -> None:
+    def _replay(
+        self,
+        parameters: list[nn.Parameter],
+        pixel_values: Tensor,
+        batches: list[slice],
+        gradient: Tensor,
+        graphs: dict[int, Tensor],
+    ) -> None:
         """Backpropagate in micro-batch order, whatever was retained: sums of floats depend on their order."""
-        with torch.enable_grad():
+
+        def backward() -> None:
+            for p in parameters:
+                p.grad = None
             for index in self._mine(batches):
                 prediction = graphs.pop(index) if index in graphs else self._predict(pixel_values[batches[index]])
                 prediction.backward(gradient[batches[index]].to(prediction.dtype))
+
+        with self.phase("replay"), torch.enable_grad():
+            self._recovering(backward, pixel_values, graphs)
+
+    def _recovering(self, attempt: Callable[[], Result], pixel_values: Tensor, graphs: dict[int, Tensor]) -> Result:
+        """`attempt()`; when memory runs out while `graphs` are kept, drop them, halve the budget, and once more.
+
+        Between exchanges with other processes, so each recovers on its own; the others wait for it.
+        """
+        while True:
+            try:
+                return attempt()
+            except torch.OutOfMemoryError:
+                num_images = sum(map(len, graphs.values()))
+                if self.budget is None or not num_images:
+                    raise
+            # Out here the error is gone, and with it the frames that held on to tensors.
+            graphs.clear()
+            self.budget.halve(pixel_values, num_images)
+            if torch.cuda.is_available():
+                torch.cuda.empty_cache()
 
     def _add_gradients(self, parameters: list[nn.Parameter], backward: Callable[[], None]) -> None:
         """Run `backward` on empty gradients, sum them over the processes, and add them to what was there.
@@ -174,7 +277,8 @@ class GroupStep:
         try:
             backward()
             if self._world > 1:
-                self._sum_over_processes(parameters)
+                with self.phase("reduce"):
+                    self._sum_over_processes(parameters)
             gradients = [p.grad for p in parameters if p.grad is not None]
             if not torch.nn.utils.get_total_norm(gradients, math.inf).isfinite():
                 raise ValueError("the gradient of this group has NaN or infinite values")
@@ -204,11 +308,12 @@ class GroupStep:
         """(B,H,W) of one micro-batch, in a context of its own.
 
         Autocast's weight cache is off: a cast made under no_grad would be reused by the replay and lose its gradient.
+        Inputs need no gradient, so that layers before the first trainable one keep nothing for the backward.
         """
         device = next(self.model.parameters()).device
         enabled = self.mixed_precision == "bf16"
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled, cache_enabled=False):
-            output = self.model(pixel_values=pixel_values.to(device))
+            output = self.model(pixel_values=pixel_values.to(device, non_blocking=True))
         prediction = output if isinstance(output, Tensor) else output.predicted_depth
         if prediction.ndim != 3 or len(prediction) != len(pixel_values):
             raise ValueError(f"the model must predict ({len(pixel_values)},H,W), got {tuple(prediction.shape)}")

@@ -14,6 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+# Values per temporary tensor of the pairwise sums: 4 MiB in float32, near enough to a cache and to a GPU's appetite.
+BLOCK_ELEMENTS = 2**20
+
 
 class GiftLoss(NamedTuple):
     """What `gift_loss` returns; the two terms are before their lambdas, the factor 2 of Eq. 5 included."""
@@ -152,28 +155,29 @@ def require_finite(values: Tensor, what: str, names: Sequence[str] | None = None
 
 
 class _PairwiseL1(torch.autograd.Function):
-    """Sum over pairs of the mean absolute difference on each pair's intersection, over (N,K) columns.
+    """Sum over pairs of the mean absolute difference on each pair's intersection, and the number of such pairs.
 
-    The gradient is built beside the value: autograd would keep N(N-1)/2 rows of K for the backward pass, this N.
+    `depth`, `mask` (N,P). Pixels that fewer than two masks hold are left out; the others are gathered block by block,
+    so that beside `gradient` (N,P), which is built with the value, the temporary memory does not depend on N or P.
     """
 
     @staticmethod
     def forward(ctx, depth: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        blocks = (mask.sum(0) >= 2).nonzero()[:, 0].split(max(1, BLOCK_ELEMENTS // len(mask)))
+        count = torch.zeros(len(mask), len(mask), dtype=torch.float64, device=mask.device)
+        for columns in blocks:
+            ones = mask[:, columns].float()
+            count += ones @ ones.T  # sums of less than 2**24 ones: exact
+        weight = torch.where(count > 0, 1 / count, 0).to(depth.dtype)
         total = depth.new_zeros(())
-        num_pairs = torch.zeros((), dtype=torch.long, device=depth.device)
         gradient = torch.zeros_like(depth) if depth.requires_grad else None
-        for i in range(len(depth) - 1):
-            both = mask[i] & mask[i + 1 :]
-            count = both.sum(1)
-            weight = torch.where(count > 0, 1 / count.clamp(min=1).to(depth.dtype), 0)
-            difference = torch.where(both, depth[i] - depth[i + 1 :], 0)
-            total += (difference.abs().sum(1) * weight).sum()
-            num_pairs += (count > 0).sum()
+        for columns in blocks:
+            value, signs = _pair_sums(depth[:, columns], mask[:, columns], weight, gradient is not None)
+            total += value
             if gradient is not None:
-                sign = difference.sign() * weight[:, None]
-                gradient[i] += sign.sum(0)
-                gradient[i + 1 :] -= sign
+                gradient[:, columns] = signs
         ctx.save_for_backward(gradient)
+        num_pairs = count.triu(1).count_nonzero()
         ctx.mark_non_differentiable(num_pairs)
         return total, num_pairs
 
@@ -184,18 +188,55 @@ class _PairwiseL1(torch.autograd.Function):
         return gradient * grad_total, None
 
 
+def _pair_sums(depth: Tensor, mask: Tensor, weight: Tensor, differentiate: bool) -> tuple[Tensor, Tensor | None]:
+    """The weighted sum over pairs of (N,K) columns, and its gradient (N,K)."""
+    total = depth.new_zeros(())
+    gradient = torch.zeros_like(depth) if differentiate else None
+    same = bool(mask.all())  # the usual case: one mask for the whole group
+    for i in range(len(depth) - 1):
+        difference = depth[i] - depth[i + 1 :]
+        if not same:  # where, not a product: an overflow outside the masks would turn 0 * inf into NaN
+            difference = torch.where(mask[i] & mask[i + 1 :], difference, 0)
+        if gradient is not None:
+            sign = difference.sign()
+            gradient[i] += weight[i, i + 1 :] @ sign
+            gradient[i + 1 :].addcmul_(sign, weight[i, i + 1 :, None], value=-1)
+        total += difference.abs_().sum(1) @ weight[i, i + 1 :]
+    return total, gradient
+
+
+class _DistanceToTarget(torch.autograd.Function):
+    """Per image the mean absolute difference to `target` on `region`, 0 where that is empty; all (N,P).
+
+    Image by image in both directions: autograd would keep and make several (N,P) tensors.
+    """
+
+    @staticmethod
+    def forward(ctx, depth: Tensor, target: Tensor, region: Tensor, count: Tensor) -> Tensor:
+        ctx.save_for_backward(depth, target, region, count)
+        sums = [torch.where(r, d - t, 0).abs_().sum() for d, t, r in zip(depth, target, region, strict=True)]
+        return torch.stack(sums) / count.clamp(min=1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_output: Tensor) -> tuple[Tensor, None, None, None]:
+        depth, target, region, count = ctx.saved_tensors
+        gradient = torch.empty_like(depth)
+        for i, scale in enumerate(grad_output / count.clamp(min=1)):
+            gradient[i] = torch.where(region[i], depth[i] - target[i], 0).sign_().mul_(scale)
+        return gradient, None, None, None
+
+
 def _consistency(depth: Tensor, region: Tensor) -> tuple[Tensor, int]:
     """Eq. 3 on checked tensors, and the number of pairs in Eq. 2."""
-    region = region.flatten(1)
-    columns = (region.sum(0) >= 2).nonzero()[:, 0]  # no pair meets anywhere else
-    total, num_pairs = _PairwiseL1.apply(depth.flatten(1)[:, columns], region[:, columns])
+    total, num_pairs = _PairwiseL1.apply(depth.flatten(1), region.flatten(1))
     return total / num_pairs.clamp(min=1), int(num_pairs)
 
 
 def _distillation(depth: Tensor, target: Tensor, region: Tensor) -> Tensor:
     """Eq. 5 on checked tensors."""
     count = region.flatten(1).sum(1)
-    per_image = _absolute(depth - target, region).flatten(1).sum(1) / count.clamp(min=1)
+    per_image = _DistanceToTarget.apply(depth.flatten(1), target.flatten(1), region.flatten(1), count)
     return 2 * per_image.sum() / (count > 0).sum().clamp(min=1)
 
 

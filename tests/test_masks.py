@@ -1,0 +1,407 @@
+"""Masks in every form: decoders against straight-line oracles, and what `find_mask` takes and refuses."""
+
+import base64
+import io
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from PIL import Image
+
+from gift_peft.data.annotations import coco_mask, ellipse_points, label_studio_mask, polygon_mask, rectangle_points
+from gift_peft.data.masks import MaskSource, find_mask, is_mask_file
+
+SIZE = (12, 8)  # width, height
+BOX = np.zeros(SIZE[::-1], bool)
+BOX[2:6, 3:9] = True
+CORNERS = [[3, 2], [9, 2], [9, 6], [3, 6]]
+
+
+# ---- decoders ----
+
+
+def inside(x: float, y: float, corners) -> bool:
+    """Even-odd rule for one point, by its crossings with a ray to the right."""
+    odd = False
+    for (x0, y0), (x1, y1) in zip(corners, corners[1:] + corners[:1], strict=True):
+        if (y0 <= y) != (y1 <= y) and x0 + (y - y0) / (y1 - y0) * (x1 - x0) <= x:
+            odd = not odd
+    return odd
+
+
+# Multiples of an odd fraction: never on a pixel's centre, where rounding would decide.
+coordinate = st.integers(-400, 1500).map(lambda value: value / 77)
+
+
+@given(st.lists(st.tuples(coordinate, coordinate), min_size=3, max_size=8))
+def test_polygon_is_the_pixels_whose_centres_it_holds(corners):
+    expected = [[inside(x + 0.5, y + 0.5, corners) for x in range(SIZE[0])] for y in range(SIZE[1])]
+    np.testing.assert_array_equal(polygon_mask(corners, SIZE), expected)
+    np.testing.assert_array_equal(polygon_mask(corners[::-1], SIZE), expected)
+
+
+@given(coordinate, coordinate)
+def test_polygons_that_share_an_edge_cover_every_pixel_once(x, y):
+    middle = (x, y)
+    border = [(-30, -30), (50, -30), (50, 50), (-30, 50)]
+    parts = [polygon_mask([middle, border[k], border[(k + 1) % 4]], SIZE).astype(int) for k in range(4)]
+    if -30 < x < 50 and -30 < y < 50:
+        np.testing.assert_array_equal(sum(parts), 1)
+
+
+def test_rectangles_and_ellipses():
+    np.testing.assert_array_equal(polygon_mask(rectangle_points(3, 2, 6, 4), SIZE), BOX)
+    np.testing.assert_array_equal(polygon_mask(rectangle_points(9, 6, -6, -4), SIZE), BOX)
+    np.testing.assert_array_equal(polygon_mask(rectangle_points(9, 2, 4, 6, 90), SIZE), BOX)  # turned clockwise
+    circle = polygon_mask(ellipse_points(50, 50, 30, 30), (100, 100))
+    assert abs(circle.sum() - np.pi * 900) < 15
+    tall = polygon_mask(ellipse_points(50, 50, 40, 10, 90), (100, 100))
+    assert abs(tall.sum() - np.pi * 400) < 15 and tall[15, 50] and not tall[50, 15]
+
+
+def run_lengths(mask: np.ndarray) -> list[int]:
+    counts, value, length = [], False, 0
+    for pixel in mask.T.ravel():
+        if pixel != value:
+            counts.append(length)
+            value, length = pixel, 0
+        length += 1
+    return [*counts, length]
+
+
+def compressed(counts: list[int]) -> str:
+    text = ""
+    for index, count in enumerate(counts):
+        number = count - counts[index - 2] if index > 2 else count
+        while True:
+            low, number = number & 31, number >> 5
+            more = number != (-1 if low & 16 else 0)
+            text += chr(48 + low + 32 * more)
+            if not more:
+                break
+    return text
+
+
+@given(arrays(bool, st.tuples(st.integers(1, 40), st.integers(1, 40))))
+def test_run_lengths_give_the_mask_back(mask):
+    height, width = mask.shape
+    counts = run_lengths(mask)
+    for form in (counts, compressed(counts)):
+        decoded = coco_mask({"segmentation": {"size": [height, width], "counts": form}}, (width, height))
+        np.testing.assert_array_equal(decoded, mask)
+
+
+def test_run_lengths_as_pycocotools_writes_them():
+    mask = np.zeros((3, 4), bool)
+    mask[1, 1:3] = True
+    np.testing.assert_array_equal(coco_mask({"segmentation": {"size": [3, 4], "counts": "41202"}}, (4, 3)), mask)
+
+
+def packed(values: np.ndarray, runs: bool) -> list[int]:
+    """Label Studio's brush stream, either one long run a stretch of equal values, or singles only."""
+    bits = f"{len(values):032b}{7:05b}" + "".join(f"{size - 1:04b}" for size in (2, 4, 8, 16))
+    place = 0
+    while place < len(values):
+        end = place + 1
+        while end < len(values) and end - place < 300 and (not runs or values[end] == values[place]):
+            end += 1
+        bits += f"{int(runs)}11{end - place - 1:016b}"
+        bits += "".join(f"{value:08b}" for value in (values[place : place + 1] if runs else values[place:end]))
+        place = end
+    bits += "0" * (-len(bits) % 8)
+    return [int(bits[start : start + 8], 2) for start in range(0, len(bits), 8)]
+
+
+@given(arrays(bool, (8, 12)), st.booleans())
+def test_brush_strokes_give_the_mask_back(mask, runs):
+    values = np.repeat(mask.astype(np.uint8)[..., None] * 255, 4, axis=2).ravel()
+    np.testing.assert_array_equal(label_studio_mask(region("brushlabels", rle=packed(values, runs)), SIZE), mask)
+
+
+def region(kind="polygonlabels", label="glass", **value) -> dict:
+    return {"type": kind, "original_width": SIZE[0], "original_height": SIZE[1], "value": {kind: [label], **value}}
+
+
+def percent(points):
+    return [[100 * x / SIZE[0], 100 * y / SIZE[1]] for x, y in points]
+
+
+# ---- files ----
+
+
+@pytest.fixture
+def group(tmp_path) -> Path:
+    """RAW/train/scene with an image 1.jpg and no mask."""
+    folder = tmp_path / "raw" / "train" / "scene"
+    folder.mkdir(parents=True)
+    Image.new("RGB", SIZE).save(folder / "1.jpg")
+    return folder
+
+
+def look(group: Path, mask_class=None, image="1.jpg") -> MaskSource | None:
+    return find_mask(group / image, group, group.parents[1], mask_class)
+
+
+def write(path: Path, content) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(content, np.ndarray):
+        Image.fromarray(content).save(path)
+    else:
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def picture(mask=BOX) -> np.ndarray:
+    return mask.astype(np.uint8) * 255
+
+
+def labelme(points=CORNERS, kind="polygon", label="glass", **more) -> dict:
+    shape = {"label": label, "points": points, "shape_type": kind, "group_id": None, "flags": {}}
+    return {
+        "version": "5.4.1",
+        "imagePath": "1.jpg",
+        "imageData": "aGVsbG8=",
+        "imageWidth": SIZE[0],
+        "imageHeight": SIZE[1],
+        "shapes": [shape],
+        **more,
+    }
+
+
+def coco(name="1.jpg", segmentation=None, **annotation) -> dict:
+    return {
+        "images": [{"id": 5, "file_name": name, "width": SIZE[0], "height": SIZE[1]}],
+        "categories": [{"id": 1, "name": "table"}, {"id": 2, "name": "glass"}],
+        "annotations": [
+            {"id": 1, "image_id": 5, "category_id": 2, "bbox": [3, 2, 6, 4], "segmentation": segmentation or []}
+            | annotation
+        ],
+    }
+
+
+def tasks(*results, image="/data/upload/3/0a1b2c3d-1.jpg", **task) -> list:
+    return [{"id": 7, "data": {"image": image}, "annotations": [{"result": list(results)}], **task}]
+
+
+POLYGON = [3, 2, 9, 2, 9, 6, 3, 6]
+GOOD = {
+    "png": ("masks/1.png", picture()),
+    "png of zeros and ones": ("masks/1.png", BOX.astype(np.uint8)),
+    "png beside": ("1_mask.png", picture()),
+    "labelme polygon": ("1.json", labelme()),
+    "labelme rectangle": ("1.json", labelme([[9, 6], [3, 2]], "rectangle")),
+    "labelme without sizes": ("masks/1.json", {"shapes": labelme()["shapes"]}),
+    "labelme in annotations": ("annotations/1.json", labelme()),
+    "coco polygon": ("annotations/instances_default.json", coco(segmentation=[POLYGON])),
+    "coco two polygons": ("x.json", coco(segmentation=[POLYGON, [4, 3, 5, 3, 5, 5]])),
+    "coco run lengths": ("x.json", coco(segmentation={"size": [8, 12], "counts": run_lengths(BOX)}, iscrowd=1)),
+    "coco compressed": ("x.json", coco(segmentation={"size": [8, 12], "counts": compressed(run_lengths(BOX))})),
+    "coco box": ("x.json", coco()),
+    "coco of Label Studio": ("result.json", coco("images\\0a1b2c3d-1.jpg")),
+    "coco at the root": ("../../annotations/instances_default.json", coco("scene/1.jpg")),
+    "coco at the split": ("../all.json", coco("elsewhere/train/scene/1.jpg")),
+    "label studio polygon": ("x.json", tasks(region(points=percent(CORNERS)))),
+    "label studio rectangle": (
+        "x.json",
+        tasks(region("rectanglelabels", x=25, y=25, width=50, height=50, rotation=0)),
+    ),
+    "label studio brush": (
+        "x.json",
+        tasks(region("brushlabels", rle=packed(np.repeat(picture().ravel(), 4), runs=True), format="rle")),
+    ),
+    "label studio local files": (
+        "../../x.json",
+        tasks(region(points=percent(CORNERS)), image="/data/local-files/?d=train/scene/1.jpg"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_forms(group, name):
+    path, content = GOOD[name]
+    path = write(group / path, content)
+    source = look(group)
+    np.testing.assert_array_equal(source.read(SIZE), BOX)
+    assert source.path.resolve() == path.resolve() and source.files == (source.path,)
+
+
+def test_labelme_circle_and_stored_mask(group):
+    write(group / "1.json", labelme([[6, 4], [9, 4]], "circle"))
+    expected = [[(x - 5.5) ** 2 + (y - 3.5) ** 2 < 9 for x in range(SIZE[0])] for y in range(SIZE[1])]
+    np.testing.assert_array_equal(look(group).read(SIZE), expected)
+    buffer = io.BytesIO()
+    Image.fromarray(BOX[2:6, 3:9]).save(buffer, "PNG")
+    content = labelme([[3, 2], [8, 5]], "mask")
+    content["shapes"][0]["mask"] = base64.b64encode(buffer.getvalue()).decode()
+    write(group / "1.json", content)
+    np.testing.assert_array_equal(look(group).read(SIZE), BOX)
+
+
+def test_one_label_is_the_target_and_several_need_a_class(group):
+    content = labelme()
+    content["shapes"].append({"label": "table", "points": [[0, 0], [12, 0], [12, 8], [0, 8]], "shape_type": "polygon"})
+    write(group / "1.json", content)
+    with pytest.raises(ValueError, match=r"1\.json: 2 labels \(glass, table\); name the target's"):
+        look(group).read(SIZE)
+    np.testing.assert_array_equal(look(group, "glass").read(SIZE), BOX)
+    assert look(group, ["glass", "table"]).read(SIZE).all()
+    with pytest.raises(ValueError, match=r"1\.json: mask_class 'mirror' is none of the labels there \(glass, table\)"):
+        look(group, "mirror").read(SIZE)
+
+
+def test_coco_classes(group):
+    content = coco(segmentation=[POLYGON])
+    content["images"].append({"id": 6, "file_name": "2.jpg", "width": SIZE[0], "height": SIZE[1]})
+    content["annotations"].append({"image_id": 6, "category_id": 1, "bbox": [0, 0, 12, 8]})
+    write(group / "x.json", content)
+    with pytest.raises(
+        ValueError, match=r"image 1\.jpg: 2 categories \(table, glass\)"
+    ):  # used in the file, if not here
+        look(group).read(SIZE)
+    for target in ("glass", 2, [2, 9]):
+        np.testing.assert_array_equal(look(group, target).read(SIZE), BOX)
+    assert not look(group, "table").read(SIZE).any()  # a known category that is not in this image
+
+
+def test_png_with_several_values_needs_a_class(group):
+    write(group / "masks/1.png", np.where(BOX, 7, np.arange(12) % 3).astype(np.uint8))
+    with pytest.raises(ValueError, match=r"masks/1\.png: 4 different values"):
+        look(group).read(SIZE)
+    np.testing.assert_array_equal(look(group, 7).read(SIZE), BOX)
+    with pytest.raises(ValueError, match=r"mask_class 'glass' is a label, and this mask holds numbers"):
+        look(group, "glass").read(SIZE)
+
+
+@pytest.mark.parametrize("place", ["", "masks/", "../", "../../"])
+def test_cvat_pictures(group, place):
+    """Its folders in the group's, in `masks/`, or above, where the names keep the group's folder."""
+    base = group / place
+    colours = np.where(BOX[..., None], (128, 0, 64), (0, 0, 0)).astype(np.uint8)
+    name = {"../": "scene/1.png", "../../": "train/scene/1.png"}.get(place, "1.png")
+    path = write(base / "SegmentationClass" / name, colours)
+    labelmap = "# label:color_rgb:parts:actions\nbackground:0,0,0::\nglass:128,0,64::\n"
+    write(path.parent.parent / "labelmap.txt", labelmap)
+    source = look(group)
+    np.testing.assert_array_equal(source.read(SIZE), BOX)
+    assert source.files == (source.path, source.path.parents[1] / "labelmap.txt")
+    write(path.parent.parent / "labelmap.txt", labelmap + "table:0,0,9::\n")
+    with pytest.raises(ValueError, match=r"2 labels of .*labelmap\.txt \(glass, table\)"):
+        look(group).read(SIZE)
+    np.testing.assert_array_equal(look(group, "glass").read(SIZE), BOX)
+    write(path.parent.parent / "labelmap.txt", "background:0,0,0::\nglass:1,1,1::\n")
+    with pytest.raises(ValueError, match=r"1 colours that .*labelmap\.txt does not name"):
+        look(group).read(SIZE)
+
+
+def labelme_at(path):
+    return labelme(imagePath=path)
+
+
+BAD = {
+    "other size": ("masks/1.png", picture(BOX.T), "masks/1.png: the mask is 8x12"),
+    "truncated": ("masks/1.png", "\x89PNG", "masks/1.png: not a readable image"),
+    "colours": ("masks/1.png", np.zeros((8, 12, 3), np.uint8), "masks/1.png: mode RGB"),
+    "labelme other size": ("1.json", labelme(imageWidth=13), "1.json: its shapes are for 13x8"),
+    "labelme absolute": ("1.json", labelme_at("/home/me/1.jpg"), "1.json: imagePath: '/home/me/1.jpg' is an absolute"),
+    "labelme climbs": ("1.json", labelme_at("..\\1.jpg"), "absolute path or climbs"),
+    "labelme drive": ("1.json", labelme_at("C:\\1.jpg"), "absolute path or climbs"),
+    "labelme other image": ("1.json", labelme_at("2.jpg"), "1.json: drawn on 2.jpg, not on 1.jpg"),
+    "labelme cut short": ("1.json", '{"shapes": [', "1.json: not valid JSON, or cut short"),
+    "labelme no label": ("1.json", labelme(label=None), "1.json: a shape, region or category without a label"),
+    "labelme line": ("1.json", labelme(CORNERS[:2], "line"), "type 'line' with 2 points has no area"),
+    "labelme two corners": ("1.json", labelme(CORNERS[:2]), "with 2 points has no area"),
+    "labelme NaN": ("1.json", labelme([[float("nan"), 1], [2, 2], [3, 3]]), "not a number within reason"),
+    "labelme shapes": ("1.json", labelme(shapes={}), "1.json: its shapes are not a list"),
+    "labelme points": ("1.json", labelme("no"), "not pairs of numbers"),
+    "coco other size": ("x.json", coco(segmentation={"size": [9, 12], "counts": [0]}), r"size \[9, 12\]"),
+    "coco short": ("x.json", coco(segmentation={"size": [8, 12], "counts": [3, 4]}), "cover 7 pixels, but .* 96"),
+    "coco negative": ("x.json", coco(segmentation={"size": [8, 12], "counts": [98, -2]}), "whole numbers from 0"),
+    "coco string": ("x.json", coco(segmentation={"size": [8, 12], "counts": "é"}), "compressed run lengths hold 'é'"),
+    "coco string end": ("x.json", coco(segmentation={"size": [8, 12], "counts": "P"}), "middle of a number"),
+    "coco odd": ("x.json", coco(segmentation=[[1, 2, 3]]), "odd length"),
+    "coco nothing": ("x.json", coco(bbox=None), "neither a segmentation nor a box"),
+    "coco category": ("x.json", coco(category_id=9), "x.json: an annotation of category 9, which is not listed"),
+    "coco image": ("x.json", coco(image_id=9), "x.json: an annotation for image id 9, which is not listed"),
+    "coco absolute": ("x.json", coco("/data/1.jpg"), "x.json: '/data/1.jpg' is an absolute path or climbs"),
+    "coco climbs": ("x.json", coco("a/../../1.jpg"), "absolute path or climbs"),
+    "label studio size": ("x.json", tasks(region(points=CORNERS) | {"original_width": 9}), "an image of 9x8"),
+    "label studio no area": ("x.json", tasks(region("keypointlabels", x=1, y=2)), "'keypointlabels' has no area"),
+    "label studio no label": ("x.json", tasks(region() | {"value": {"points": CORNERS}}), "without a label"),
+    "label studio cut": ("x.json", tasks(region("brushlabels", rle=[0, 0, 1, 128])), "cut short"),
+    "label studio count": ("x.json", tasks(region("brushlabels", rle=packed(np.zeros(9, int), True))), "9 values"),
+    "label studio bytes": ("x.json", tasks(region("brushlabels", rle=[1, 999])), "not bytes"),
+    "label studio climbs": ("x.json", tasks(image="http://host/../1.jpg"), "absolute path or climbs"),
+    "label studio pictures": ("masks/task-1-annotation-2-by-1-tag-glass-0.png", picture(), "rename it to 1_mask.png"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_refusals_name_the_file(group, name):
+    path, content, message = BAD[name]
+    write(group / path, content)
+    with pytest.raises(ValueError, match=message) as error:
+        look(group).read(SIZE)
+    assert path.rpartition("/")[2] in str(error.value) and "\n" not in str(error.value)
+
+
+def test_nothing_and_things_that_are_no_masks(group):
+    assert look(group) is None
+    write(group / "1.json", {"exposure": 4})  # a camera's notes
+    write(group / "camera.json", {"fx": 600})
+    write(group / "x.json", coco("other.jpg"))
+    write(group.parents[1] / "all.json", coco("1.jpg"))  # above the group a name must say which group
+    write(group.parents[2] / "x.json", coco("raw/train/scene/1.jpg"))  # outside the root
+    assert look(group) is None
+
+
+def test_one_name_for_several_images_is_refused(group):
+    for folder in ("a", "b"):
+        write(group / folder / "3.png", np.zeros((8, 12, 3), np.uint8))
+    write(group / "masks/3.png", picture())
+    with pytest.raises(ValueError, match=r"masks/3\.png may belong to several images called 3"):
+        look(group, image="a/3.png")
+    write(group / "masks/a/3.png", picture())
+    assert look(group, image="a/3.png").path == group / "masks/a/3.png"
+    (group / "masks/3.png").unlink()
+    write(group / "x.json", coco("3.png"))
+    with pytest.raises(ValueError, match=r"x\.json: 3\.png may mean several images"):
+        look(group, image="b/3.png")
+    write(group / "x.json", coco("b/3.png"))
+    np.testing.assert_array_equal(look(group, image="b/3.png").read(SIZE), BOX)
+
+
+def test_links_stay_inside_the_root(group, tmp_path):
+    outside = write(tmp_path / "outside.png", picture())
+    (group / "masks").mkdir()
+    link = group / "masks/1.png"
+    link.symlink_to(outside)
+    with pytest.raises(ValueError, match=r"masks/1\.png: a link that leads out of"):
+        look(group)
+    link.unlink()
+    link.symlink_to("1.png")  # to itself
+    with pytest.raises(ValueError, match=r"masks/1\.png: a link that leads nowhere"):
+        look(group)
+    link.unlink()
+    link.symlink_to(write(group.parents[1] / "shared.png", picture()))
+    np.testing.assert_array_equal(look(group).read(SIZE), BOX)
+
+
+def test_a_changed_export_is_read_again(group):
+    path = write(group / "x.json", coco())
+    source = look(group)
+    np.testing.assert_array_equal(source.read(SIZE), BOX)
+    write(path, coco(bbox=[0, 0, 12, 8]))
+    os.utime(path, ns=(1, 1))
+    assert source.read(SIZE).all()
+
+
+def test_which_pictures_are_masks(group):
+    for name in ("2.jpg", "gas_mask.png", "1_mask.png", "masks/1.png", "SegmentationObject/1.png"):
+        write(group / name, picture())
+    names = ("1.jpg", "2.jpg", "gas_mask.png", "1_mask.png", "masks/1.png", "SegmentationObject/1.png")
+    assert [is_mask_file(group / name, group) for name in names] == [False, False, False, True, True, True]

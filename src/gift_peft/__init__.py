@@ -24,6 +24,7 @@ _HOME = {
     "VggtForDepthEstimation": "models.vggt",
     "align": "evaluation.alignment",
     "depth_metrics": "evaluation.metrics",
+    "evaluate_booster": "evaluation.booster",
     "evaluate_gift_i": "evaluation.evaluate",
     "geometry_consistency_error": "losses",
     "get_gift_model": "adapters",

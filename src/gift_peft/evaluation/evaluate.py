@@ -5,18 +5,24 @@ model's prediction on the treated reference, or true depth) and scored per regio
 The consensus is the base with its target replaced by the group's per-pixel median: what Eq. 3 pulls towards.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
 from gift_peft.data.gift_i import load_gift_i
-from gift_peft.data.preprocess import Group, collate_group, resolve_size
-from gift_peft.evaluation.predict import load_model, predict_depth, prediction_kind
+from gift_peft.data.preprocess import Group, collate_group
+from gift_peft.evaluation.predict import load_model, prediction_kind
+from gift_peft.evaluation.predictors import (
+    evaluating,
+    make_predictors,
+    network_size,
+    own_processor,
+    to_millimetres,
+)
 from gift_peft.evaluation.protocols import Protocol, get_protocol
 from gift_peft.evaluation.report import Panel, markdown_table, text_table
 from gift_peft.evaluation.results import (
@@ -28,7 +34,7 @@ from gift_peft.evaluation.results import (
     summarize_gce,
     write_text,
 )
-from gift_peft.evaluation.scoring import NO_DEPTH, Predictor, Task, evaluate_group, references, resize_prediction
+from gift_peft.evaluation.scoring import NO_DEPTH, Task, evaluate_group, references, resize_prediction
 
 REFERENCES = {"proxy": "native", "depth": "gift"}  # and the protocol that goes with each
 
@@ -45,6 +51,7 @@ def evaluate_gift_i(
     kind: str | None = None,
     baseline: bool = True,
     accelerator: Any = None,
+    prediction_scale: float | None = None,
     batch_size: int = 2,
     progress: bool = True,
 ) -> GiftIReport:
@@ -69,6 +76,8 @@ def evaluate_gift_i(
         baseline (`bool`): False leaves out the base, the consensus and the collapse check (to validate in training).
         accelerator (`accelerate.Accelerator`, *optional*): spreads the groups over its processes; every process gets
             the whole report.
+        prediction_scale (`float`, *optional*): predictions times this are in mm, for protocols that fit no scale;
+            default 1000 for models that say they are metric, which predict metres, else 1.
         batch_size (`int`): the cut of a group, in image order, as the teacher's.
 
     Raises:
@@ -82,7 +91,7 @@ def evaluate_gift_i(
         raise ValueError("evaluate_gift_i needs a model")
     if isinstance(dataset, str | Path):
         dataset = load_gift_i(dataset, "validation")
-    rules = get_protocol(protocol or REFERENCES[reference])
+    rules = replace(get_protocol(protocol or REFERENCES[reference]), resolution=1.0)  # on the reference's own grid
     if reference == "proxy" and rules.space != "native":
         raise ValueError(
             f'protocol {rules.name} aligns to depth in {rules.unit}; proxies are in native units: use "native", or '
@@ -93,14 +102,14 @@ def evaluate_gift_i(
         kind = "depth" if reference == "proxy" else prediction_kind(model)
     if reference == "depth" and rules.space == "native" and kind == "inverse_depth":
         raise ValueError(f'protocol {rules.name} would fit inverse depth straight to depth; use "gift"')
-    predictors, frozen = _predictors(model, teacher, baseline, batch_size)
+    predictors, frozen = make_predictors(model, teacher, baseline, batch_size)
     models = [*predictors, *(["consensus"] if "base" in predictors else [])]
-    task = Task(predictors, frozen, models, rules, reference, kind)
+    task = Task(predictors, frozen, models, rules, reference, kind, prediction_scale or to_millimetres(model, rules))
 
     rank, world = (accelerator.process_index, accelerator.num_processes) if accelerator else (0, 1)
     prepare = _collator(dataset, model, processor, size)
     results = []
-    with _evaluating(model, teacher):
+    with evaluating(model, teacher):
         for index in tqdm(
             range(rank, len(dataset), world),
             desc="evaluate",
@@ -190,10 +199,10 @@ def make_panel(
         ValueError: the group has no such reference.
     """
     kind = kind or prediction_kind(model)
-    predictors, frozen = _predictors(model, teacher, True, batch_size)
+    predictors, frozen = make_predictors(model, teacher, True, batch_size)
     task = Task(predictors, frozen, [], get_protocol(REFERENCES[reference]), reference, kind)
     group = _collator([row], model, processor, size)(row)
-    with _evaluating(model, teacher):
+    with evaluating(model, teacher):
         targets, masks, _ = references(row, group, task)
         if targets[index] is None:
             raise ValueError(f"group {group.group_id} has no {reference} to compare with")
@@ -204,89 +213,30 @@ def make_panel(
     return Panel(label, row["images"][index], targets[index], base, adapted, masks[index], kind, task.protocol.name)
 
 
-# ---- the models ----
-
-
-def _predictors(model, teacher, baseline: bool, batch_size: int) -> tuple[dict[str, Predictor], Predictor]:
-    """The predictors to compare, and the frozen one."""
-
-    def plain(network):
-        return lambda pixel_values: predict_depth(network, pixel_values, batch_size)
-
-    own = plain(model)
-    if hasattr(model, "disable_adapter"):
-
-        def frozen(pixel_values):
-            with model.disable_adapter():
-                return own(pixel_values)
-
-    elif teacher is not None:
-        frozen = plain(load_model(teacher).model if isinstance(teacher, str | Path) else teacher)
-    else:
-        return {"base": own}, own
-    return ({"base": frozen, "adapted": own} if baseline else {"adapted": own}), frozen
-
-
-@contextmanager
-def _evaluating(*models: Any) -> Iterator[None]:
-    """Eval mode inside; afterwards every module's mode and every parameter's requires_grad are as before.
-
-    (`disable_adapter()` turns gradients on for every adapter parameter when it ends, frozen ones included.)
-    """
-    networks = [model for model in models if isinstance(model, torch.nn.Module)]
-    modes = [(module, module.training) for network in networks for module in network.modules()]
-    gradients = [(weight, weight.requires_grad) for network in networks for weight in network.parameters()]
-    for network in networks:
-        network.eval()
-    try:
-        yield
-    finally:
-        for module, mode in modes:
-            module.training = mode
-        for weight, flag in gradients:
-            weight.requires_grad_(flag)
-
-
 def _collator(dataset, model, processor, size) -> Callable[[dict], Group]:
     """Rows to groups, at the size of the stored proxies where there are any."""
     first = dataset[0] if len(dataset) else None
     if first is None or isinstance(first, Group):
         return lambda group: group
-    if processor is None:
-        from transformers import AutoImageProcessor
-
-        config = getattr(model, "config", None)
-        source = getattr(config, "_name_or_path", "")
-        if not source:
-            raise ValueError("evaluate_gift_i: the model does not say where it came from; pass its processor=")
-        processor = AutoImageProcessor.from_pretrained(source)
+    processor = processor or own_processor(model)
     for name in ("proxies", "reference_proxy"):
         if size is None and first.get(name) is not None:
             size = np.asarray(first[name]).shape[-2:]
-    if size is None:
-        size = resolve_size(None, _recipe(model), processor)
-    return lambda row: collate_group(row, processor, tuple(size))
-
-
-def _recipe(model):
-    from gift_peft.adapters import get_recipe
-
-    try:
-        return get_recipe(model)
-    except ValueError:
-        return None  # an architecture without a recipe: its image processor states the size
+    size = network_size(size, model, processor)
+    return lambda row: collate_group(row, processor, size)
 
 
 def _report(groups: list[dict], rows: list[dict], task: Task) -> GiftIReport:
     subject = "adapted" if "adapted" in task.models else "base"
     compared = {"base", "adapted"} <= set(task.models)
+    average = task.protocol.aggregation
     return GiftIReport(
-        summary=summarize(rows, subject),
-        base=summarize(rows, "base") if "base" in task.models else None,
-        consensus=summarize(rows, "consensus") if "consensus" in task.models else None,
+        summary=summarize(rows, subject, average),
+        base=summarize(rows, "base", average) if "base" in task.models else None,
+        consensus=summarize(rows, "consensus", average) if "consensus" in task.models else None,
         gce=summarize_gce(groups, task.models),
         collapse=detect_collapse(rows) if compared else None,
-        by_surface=by_surface(rows, task.models, subject),
+        by_surface=by_surface(rows, task.models, subject, average),
         counts=count_rows(rows, len(groups), subject),
         protocol=task.protocol.to_dict() | {"description": task.protocol.describe()},
         reference=task.reference,

@@ -1,7 +1,8 @@
 """Scale and shift of flat float64 arrays under the losses that a `Protocol` names.
 
-Least squares is a closed form on centred data. The weighted L1 fit is exact: for one scale the best shift is a weighted
-median, what is left is convex in the scale and is bisected by its subgradient. Huber is reweighted least squares.
+Least squares is a closed form on centred data. The weighted L1 fit is exact: for one scale the best shift is a
+weighted median, what is left is convex in the scale and is bisected by its subgradient. Huber is reweighted least
+squares.
 """
 
 import numpy as np
@@ -159,7 +160,7 @@ def _weighted_median(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 def nearest_to_grid(mask: np.ndarray, cells: int = SUBSAMPLE) -> np.ndarray:
-    """(H,W) bool to the true pixel nearest to the centre of each cell of a `cells` x `cells` grid, cells without left out.
+    """(H,W) bool, of which only the pixel nearest to the centre of each cell of a `cells` x `cells` grid is left.
 
     MoGe's subsample for L1 fits; a mask of no more than `cells` rows and columns comes back as it is.
     """

@@ -1,8 +1,8 @@
 """Named sets of evaluation choices: a depth error means nothing without the way it was aligned and averaged.
 
 Every table prints the protocol it was made with. `gift` is the paper's affine-aligned evaluation (Experiments,
-"Metrics and affine-aligned evaluation"); `native` is the same fit inside the teacher's own output space; the others are
-what published evaluators do, so that numbers can be compared with theirs.
+"Metrics and affine-aligned evaluation"); `native` is the same fit inside the teacher's own output space; the others
+are what published evaluators do, so that numbers can be compared with theirs.
 """
 
 from dataclasses import asdict, dataclass

@@ -1,6 +1,6 @@
 """What an evaluation leaves behind: per-image rows, their means per region, GCE, the collapse alarm, and the files.
 
-Summaries are means over images, pixels or groups (NaN left out and counted) that do not depend on the order of the rows.
+Summaries are means over images, pixels or groups (NaN left out and counted), whatever the order of the rows.
 """
 
 import json
@@ -118,8 +118,8 @@ class BoosterReport(Report):
         adapted (`bool`): whether `summary` is of an adapted model.
         groups (`list[dict]`): illumination GCE per scene.
         rows (`list[dict]`): one per image, see `evaluate_booster`.
-        about (`dict`): `dataset`, `root`, `subset`, `resize`, `occlusion`, `tom_classes`, `kind`, `official` and, where
-            the caller knows, `base`, `adapter`, `predictions`.
+        about (`dict`): `root`, `subset`, `resize`, `occlusion`, `tom_classes`, `kind`, `official` (whether it was the
+            complete official training set), and, where the caller knows, `predictions`, `base`, `adapter`, ...
     """
 
     summary: dict
@@ -247,7 +247,8 @@ def by_surface(rows: list[dict], models: list[str], subject: str, aggregation: s
     result = {}
     for surface in surfaces:
         own = [row for row in rows if (row["surface"] or "unknown") == surface]
-        result[surface] = {"num_images": count_scored(own, subject, "tom"), "summary": summarize(own, subject, aggregation)}
+        result[surface] = {"num_images": count_scored(own, subject, "tom")}
+        result[surface]["summary"] = summarize(own, subject, aggregation)
         for model in ("base", "consensus"):
             result[surface][model] = summarize(own, model, aggregation) if model in models else None
     return result

@@ -7,19 +7,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
 from gift_peft.data.preprocess import Group, to_mask
-from gift_peft.evaluation.alignment import align, known
+from gift_peft.evaluation.alignment import align, known, to_numpy
 from gift_peft.evaluation.fitting import DegenerateFitError
 from gift_peft.evaluation.metrics import METRICS, depth_metrics
+from gift_peft.evaluation.predictors import Predictor
 from gift_peft.evaluation.protocols import Protocol
 from gift_peft.evaluation.results import REGIONS
 from gift_peft.losses import GeometryConsistencyError, prediction_spread, require_finite
 
 NO_PROXY, NO_DEPTH = "without a treated reference", "without true depth"  # why a row is skipped
-Predictor = Callable[[torch.Tensor], torch.Tensor]
 
 
 @dataclass
@@ -32,6 +33,7 @@ class Task:
     protocol: Protocol
     reference: str
     kind: str
+    prediction_scale: float = 1.0
 
 
 def evaluate_group(row: Any, prepare: Callable[[Any], Group], task: Task) -> tuple[dict, list[dict]]:
@@ -59,10 +61,14 @@ def evaluate_group(row: Any, prepare: Callable[[Any], Group], task: Task) -> tup
             "target_pixels": int(np.count_nonzero(masks[index] & valids[index])),
         }
         own_valid = None if group.valid is None else group.valid[index]
+        missing = NO_PROXY if task.reference == "proxy" else NO_DEPTH
+        where = targets[index], masks[index], valids[index]
+        score = Scorer(*where, task.protocol, task.kind, task.prediction_scale, missing)
+        result["pixels"] = score.pixels
         for model in task.models:
             prediction = predictions[model][index]
-            result[model] = _native_statistics(prediction, group.mask[index], own_valid)
-            scores, skipped = _score(prediction, targets[index], masks[index], valids[index], task)
+            result[model] = native_statistics(prediction, group.mask[index], own_valid)
+            scores, skipped = score(prediction)
             result[model] |= scores
             if skipped and not result["skipped"]:
                 result["skipped"] = skipped.format(model=model)
@@ -94,7 +100,8 @@ def _check_prediction(prediction: torch.Tensor, group: Group, model: str) -> Non
     require_finite(prediction, f"group {group.group_id}: the {model} prediction", group.names)
 
 
-def _native_statistics(prediction: torch.Tensor, mask: torch.Tensor, valid: torch.Tensor | None) -> dict:
+def native_statistics(prediction: torch.Tensor, mask: torch.Tensor, valid: torch.Tensor | None = None) -> dict:
+    """Mean over the target and spread of a (h,w) prediction, in its units, which tell whether outputs collapse."""
     target = prediction[mask if valid is None else mask & valid]
     mean = float(target.double().mean()) if target.numel() else float("nan")
     return {"target_mean": mean, "spread": prediction_spread(prediction, valid)}
@@ -126,27 +133,54 @@ def references(row: Any, group: Group, task: Task) -> tuple[Sequence, list[np.nd
     )
 
 
-def _score(
-    prediction: torch.Tensor, reference: np.ndarray | None, mask: np.ndarray, valid: np.ndarray, task: Task
-) -> tuple[dict, str | None]:
-    """Alignment and metrics per region of one prediction; NaN and the reason where there is nothing to compare."""
-    nothing = {"scale": float("nan"), "shift": float("nan"), "num_clipped": 0, "num_nonpositive": 0}
-    nothing |= {region: dict.fromkeys(METRICS, float("nan")) for region in REGIONS}
-    if reference is None or np.count_nonzero(valid & known(reference)) < 2:
-        return nothing, NO_PROXY if task.reference == "proxy" else NO_DEPTH
-    try:
-        alignment = align(resize_prediction(prediction, reference.shape), reference, valid, task.protocol, task.kind)
-    except DegenerateFitError:
-        return nothing, "with a constant {model} prediction"
-    scores = {name: getattr(alignment, name) for name in ("scale", "shift", "num_clipped", "num_nonpositive")}
-    regions = {"all": valid, "tom": valid & mask, "other": valid & ~mask}
-    return scores | {name: depth_metrics(alignment.aligned, reference, regions[name]) for name in REGIONS}, None
+class Scorer:
+    """Alignment and metrics per region of the predictions of one image.
+
+    Args:
+        reference (`np.ndarray`, *optional*): (H,W), in mm or native units; None where there is none.
+        mask, valid (`np.ndarray`): (H,W) bool, the target and the pixels that exist.
+        protocol, kind: as in `align`.
+        prediction_scale (`float`): what predictions are multiplied by first.
+        missing (`str`): the reason to give where the reference says nothing.
+    """
+
+    def __init__(
+        self,
+        reference: np.ndarray | None,
+        mask: np.ndarray,
+        valid: np.ndarray,
+        protocol: Protocol,
+        kind: str,
+        prediction_scale: float = 1.0,
+        missing: str = NO_DEPTH,
+    ) -> None:
+        self.reference, self.protocol, self.kind, self.scale = reference, protocol, kind, prediction_scale
+        self.missing = missing
+        there = np.zeros(valid.shape, bool) if reference is None else valid & known(reference)
+        self.regions = {"all": there, "tom": there & mask, "other": there & ~mask}
+        self.fit = self.regions["other"] if protocol.fit_region == "other" else there
+        self.pixels = {name: int(np.count_nonzero(self.regions[name])) for name in REGIONS}
+
+    def __call__(self, prediction: Any) -> tuple[dict, str | None]:
+        """Scores of a (h,w) prediction of any size; NaN and the reason where there is nothing to compare."""
+        nothing = {"scale": float("nan"), "shift": float("nan"), "num_clipped": 0, "num_nonpositive": 0}
+        nothing |= {region: dict.fromkeys(METRICS, float("nan")) for region in REGIONS}
+        if self.pixels["all"] < 2:
+            return nothing, self.missing
+        prediction = resize_prediction(prediction, self.reference.shape) * self.scale
+        try:
+            alignment = align(prediction, self.reference, self.fit, self.protocol, self.kind)
+        except DegenerateFitError:
+            return nothing, "with a constant {model} prediction" if self.fit.any() else "without pixels to fit"
+        scores = {name: getattr(alignment, name) for name in ("scale", "shift", "num_clipped", "num_nonpositive")}
+        for name in REGIONS:
+            scores[name] = depth_metrics(alignment.aligned, self.reference, self.regions[name])
+        return scores, None
 
 
-def resize_prediction(prediction: torch.Tensor, size: tuple[int, int]) -> np.ndarray:
-    """(h,w) to the reference's (H,W) float64, bilinearly where they differ."""
-    prediction = prediction.double()
-    if prediction.shape != size:
-        resized = torch.nn.functional.interpolate(prediction[None, None], size, mode="bilinear", align_corners=False)
-        prediction = resized[0, 0]
-    return prediction.numpy()
+def resize_prediction(prediction: Any, size: tuple[int, int]) -> np.ndarray:
+    """(h,w) numpy or torch to the reference's (H,W) float64, by OpenCV's bilinear interpolation where they differ."""
+    prediction = to_numpy(prediction, np.float64)
+    if prediction.shape != tuple(size):
+        prediction = cv2.resize(prediction, size[::-1], interpolation=cv2.INTER_LINEAR)
+    return prediction

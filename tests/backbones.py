@@ -62,8 +62,12 @@ def tiny_vggt(seed: int = 0, **changes) -> VggtForDepthEstimation:
 
 
 def tiny_metric3d(seed: int = 0, **changes) -> Metric3DForDepthEstimation:
-    """In eval mode."""
-    return randomize(Metric3DForDepthEstimation(Metric3DConfig(**METRIC3D | changes)), seed, gain=1.4).eval()
+    """In eval mode; the recurrence moves by metres, so that depth stays inside its range."""
+    model = randomize(Metric3DForDepthEstimation(Metric3DConfig(**METRIC3D | changes)), seed, gain=1.4).eval()
+    head = model.depth_model.decoder.update_block.flow_head
+    for weight in (head.conv2d.weight, head.conv2d.bias):
+        weight.data.mul_(0.02)
+    return model
 
 
 def vggt_golden() -> tuple[dict, dict, dict]:

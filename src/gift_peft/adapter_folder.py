@@ -1,0 +1,156 @@
+"""An adapter as a folder in PEFT's format, with the image processor and `gift.json`, which says how it was made.
+
+The folder is whole or absent. For Depth Anything it loads with peft and transformers alone.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import shutil
+import warnings
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from peft import PeftModel
+from peft.tuners.lora import LoraLayer
+
+from gift_peft.adapter_scale import active_lora, active_saved_modules
+
+ADAPTER_CONFIG = "adapter_config.json"
+ADAPTER_FILES = {ADAPTER_CONFIG, "adapter_model.safetensors", "preprocessor_config.json", "gift.json", "README.md"}
+
+
+def save_adapter(
+    model: PeftModel,
+    folder: str | Path,
+    base_model_name_or_path: str | None = None,
+    revision: str | None = None,
+    *,
+    processor: Any = None,
+    size: tuple[int, int] | None = None,
+    gift: Mapping[str, Any] | None = None,
+    card: str | None = None,
+) -> None:
+    """Write an adapter folder in PEFT's format; it replaces an earlier one as a whole, or not at all.
+
+    Args: `base_model_name_or_path`, `revision` of the base (default: where the model was loaded from); `processor` an
+    image processor, written with `size` (height, width); `gift` what `gift.json` says besides versions and size (NaN
+    becomes null); `card` the finished README.md. A local base path is warned about: others cannot load
+    the adapter by name; it stays out of the card.
+    Raises ValueError if an adapter scale other than 1 is set, if `folder` holds other files, and if the card names an
+    absolute base path; NotADirectoryError if `folder` is a file.
+    """
+    if not isinstance(model, PeftModel) or "default" not in model.peft_config:
+        raise ValueError(
+            "save_adapter needs a PeftModel whose adapter is called 'default', as get_gift_model makes it"
+        )
+    if any(layer.scaling[name] != _full_scaling(layer, name) for layer, name in active_lora(model)) or any(
+        vars(wrapper).get("_gift_trained") for wrapper, _ in active_saved_modules(model)
+    ):
+        raise ValueError("an adapter is saved at scale 1: call set_adapter_scale(model, 1) first")
+    folder = Path(folder)
+    _check_replaceable(folder)
+    base = base_model_name_or_path or _base_name(model)
+    hub_base = _hub_name(base, card)
+    temporary = folder.with_name(f".{folder.name}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    try:
+        model.save_pretrained(temporary, selected_adapters=["default"], save_embedding_layers=False)
+        config = json.loads((temporary / ADAPTER_CONFIG).read_text())
+        config.update(base_model_name_or_path=base, revision=revision)
+        _write_json(temporary / ADAPTER_CONFIG, config)
+        if processor is not None:
+            # Not save_pretrained: it would put the code of VGGT's and Metric3D's processors beside the adapter.
+            _at_size(processor, size).to_json_file(temporary / "preprocessor_config.json")
+        _write_json(temporary / "gift.json", _gift_json(gift, size))
+        # Last: PEFT writes a README of its own, which names a local base path.
+        (temporary / "README.md").write_text(card or _minimal_card(hub_base), encoding="utf-8")
+        _replace_folder(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _full_scaling(layer: LoraLayer, name: str) -> float:
+    rank = layer.r[name]
+    return layer.lora_alpha[name] / (math.sqrt(rank) if layer.use_rslora.get(name) else rank)
+
+
+def _base_name(model: PeftModel) -> str | None:
+    name = model.peft_config["default"].base_model_name_or_path or getattr(model.get_base_model(), "name_or_path", "")
+    if not name:
+        warnings.warn("the adapter names no base model: give base_model_name_or_path to load it by name", stacklevel=3)
+    return name or None
+
+
+def _hub_name(base: str | None, card: str | None) -> str | None:
+    """`base` if it may stand in a card: not a path of this machine."""
+    if base is None or not Path(base).exists():
+        return base
+    warnings.warn(
+        f"the base is the local folder {base}: others cannot load this adapter by its base's name; "
+        "give a hub id as base_model_name_or_path to publish it",
+        stacklevel=2,
+    )
+    if card and Path(base).is_absolute() and base in card:
+        raise ValueError(f"the card names the local base path {base}")
+    return None
+
+
+def _check_replaceable(folder: Path) -> None:
+    if folder.exists() and (others := sorted({path.name for path in folder.iterdir()} - ADAPTER_FILES)):
+        raise ValueError(
+            f"{folder} holds files that are no adapter's ({', '.join(others[:3])}): choose another folder"
+        )
+
+
+def _replace_folder(new: Path, folder: Path) -> None:
+    old = folder.with_name(f".{folder.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.rename(old)
+    new.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _at_size(processor: Any, size: tuple[int, int] | None) -> Any:
+    """A copy of the image processor that resizes every image to exactly (height, width)."""
+    if size is None:
+        return processor
+    processor = copy.deepcopy(processor)
+    processor.do_resize = True
+    processor.size = {"height": size[0], "width": size[1]}
+    if hasattr(processor, "keep_aspect_ratio"):
+        processor.keep_aspect_ratio = False
+    return processor
+
+
+def _gift_json(gift: Mapping[str, Any] | None, size: tuple[int, int] | None) -> dict[str, Any]:
+    packages = ("gift-peft", "torch", "transformers", "peft", "accelerate")
+    return {
+        "versions": {name: version(name) for name in packages},
+        "size": size,
+        **(gift or {}),
+    }
+
+
+def _minimal_card(hub_base: str | None) -> str:
+    base = [f"base_model: {hub_base}", "base_model_relation: adapter"] if hub_base else []
+    head = ["---", "library_name: peft", "pipeline_tag: depth-estimation", *base, "tags:", "- gift", "- lora", "---"]
+    return "\n".join(head) + "\n\n# GIFT adapter\n\nMade with gift-peft; `gift.json` says how.\n"
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(_nan_to_null(content), indent=2, default=str, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _nan_to_null(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _nan_to_null(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_nan_to_null(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

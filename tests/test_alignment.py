@@ -1,5 +1,7 @@
 """`align` against numpy's lstsq, straight-line loops, and the affine invariance it exists for."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from gift_peft.evaluation.alignment import align
 from gift_peft.evaluation.fitting import DegenerateFitError
 from gift_peft.evaluation.metrics import depth_metrics
-from gift_peft.evaluation.protocols import PROTOCOLS, Protocol, get_protocol, list_protocols
+from gift_peft.evaluation.protocols import KINDS, PROTOCOLS, Protocol, get_protocol, list_protocols
 
 SHAPE = (7, 9)
 ALL = np.ones(SHAPE, bool)
@@ -70,7 +72,7 @@ def test_against_lstsq(seed, protocol, kind):
 @settings(max_examples=40, deadline=None)
 @given(seeds, st.floats(0.01, 100), st.floats(-50, 50), st.sampled_from(["depth", "inverse_depth"]))
 def test_affine_changes_of_the_prediction_change_nothing(seed, scale, shift, kind):
-    truth, prediction = scene(seed), np.random.default_rng(seed).uniform(1, 2, SHAPE)
+    truth, prediction = scene(seed), np.random.default_rng([seed, 1]).uniform(1, 2, SHAPE)
     first = align(prediction, truth, ALL, "gift", kind)
     second = align(scale * prediction + shift, truth, ALL, "gift", kind)
     np.testing.assert_allclose(second.aligned, first.aligned, rtol=1e-6)
@@ -193,6 +195,113 @@ def test_wrong_arguments():
         align(truth, truth, ALL, kind="disparity")
     with pytest.raises(ValueError, match="unknown protocol 'mine': choose one of gift, native"):
         align(truth, truth, ALL, "mine")
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, st.sampled_from(["depth4tom", "gift-literal", "ntire25", "moge-affine"]), st.sampled_from(KINDS))
+def test_presets_against_straight_line_code(seed, name, kind):
+    """Space, loss, floor, clip and the sign of disparity of each preset, pixel by pixel."""
+    rng = np.random.default_rng(seed)
+    truth, prediction = scene(seed), rng.normal(3, 1, SHAPE)
+    if kind == "depth" and name == "depth4tom":
+        prediction = np.abs(prediction) + 0.1
+    valid = rng.random(SHAPE) < 0.6
+    inverse = name == "depth4tom" or (name == "moge-affine" and kind == "inverse_depth")
+    values = 1 / prediction if name == "depth4tom" and kind == "depth" else prediction
+    target = 1 / truth if inverse else truth
+    if name == "moge-affine" and kind == "depth":
+        lines = []
+        where = np.argwhere(valid)
+        for i in range(len(where)):
+            for j in range(i):
+                (a, b), (c, d) = ((values[tuple(p)], target[tuple(p)]) for p in (where[i], where[j]))
+                slope = (d - b) / (c - a)
+                lines.append((slope, b - slope * a))
+        costs = [np.sum(np.abs(s * values[valid] + t - target[valid]) / target[valid]) for s, t in lines]
+        scale, shift = lines[int(np.argmin(costs))]
+    else:
+        scale, shift = lstsq(values[valid], target[valid])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        found = align(prediction, truth, valid, name, kind)
+    assert (found.scale, found.shift) == pytest.approx((scale, shift), rel=1e-7)
+    for row in range(SHAPE[0]):
+        for column in range(SHAPE[1]):
+            value = scale * values[row, column] + shift
+            if inverse and name == "moge-affine":
+                value = 1 / max(value, 1 / truth[valid].max())
+            elif inverse:
+                value = 1 / value
+            if name != "moge-affine":
+                value = min(max(value, 1.0), 10000.0)
+            assert found.aligned[row, column] == pytest.approx(value, rel=1e-5)
+
+
+@pytest.mark.parametrize("convert", [np.asarray, torch.from_numpy])
+def test_metric_changes_nothing_but_the_range(convert):
+    truth = scene(1)
+    prediction = truth * 1.1
+    prediction[0, :2] = [-4, 20000]
+    found = align(convert(prediction), convert(truth), convert(ALL), "metric")
+    np.testing.assert_array_equal(np.asarray(found.aligned), np.clip(prediction, 1, 10000))
+    assert (found.scale, found.shift, found.num_nonpositive, found.num_clipped) == (1, 0, 1, 2)
+    constant = align(convert(np.full(SHAPE, 700.0)), convert(truth), convert(~ALL), "metric")
+    assert (np.asarray(constant.aligned) == 700).all()
+    with pytest.raises(ValueError, match="compares depth with depth; this is inverse depth"):
+        align(prediction, truth, ALL, "metric", "inverse_depth")
+
+
+def test_negative_disparity_is_near_in_depth4tom_and_zero_is_far():
+    truth = np.array([[1000.0, 2000.0, 4000.0, 8000.0, 0, 0, 0]])
+    prediction = np.array([[8.0, 4.0, 2.0, 1.0, 0.0, -1.0, 0.01]])
+    valid = np.ones(truth.shape, bool)
+    found = align(prediction, truth, valid, "depth4tom", "inverse_depth")
+    # The zero lands within rounding of zero, on either side: only far from it is the sign a matter of the data.
+    np.testing.assert_allclose(found.aligned[0, [0, 1, 2, 3, 5, 6]], [1000, 2000, 4000, 8000, 1, 10000], rtol=1e-9)
+    far = align(prediction, truth, valid, "gift", "inverse_depth")
+    assert far.aligned[0, 5] == 10000 and found.num_nonpositive == far.num_nonpositive >= 1
+    mine = Protocol("mine", space="inverse", dof="none", clip=(1e-3, 10.0), nonpositive="near")
+    disparity = np.array([[2.0, 1.0, 0.0, -1.0]])
+    exact = align(disparity, np.ones(disparity.shape), disparity > 0, mine, "inverse_depth")
+    np.testing.assert_array_equal(exact.aligned, [[0.5, 1, 10, 1e-3]])
+
+
+def test_depth_without_an_inverse_stays_out_of_the_fit_and_is_near():
+    truth = np.array([[1000.0, 2000.0, 4000.0, 500.0]])
+    prediction = np.array([[1.0, 2.0, 4.0, -3.0]])
+    found = align(prediction, truth, np.ones(truth.shape, bool), "depth4tom", "depth")
+    np.testing.assert_allclose(found.aligned, [[1000, 2000, 4000, 1]], rtol=1e-9)
+    assert (found.num_nonpositive, found.num_clipped) == (1, 1)
+
+
+def test_fits_of_disparity_to_depth_are_told():
+    truth = scene(3)
+    with pytest.warns(UserWarning, match="gift-literal fits inverse depth straight to depth"):
+        assert align(1 / truth, truth, ALL, "gift-literal", "inverse_depth").scale < 0
+    with pytest.warns(UserWarning, match="the fitted scale is negative"):
+        align(1 / truth, truth, ALL, "gift-literal", "depth")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        align(truth / 7, truth, ALL, "gift-literal", "depth")
+        align(1 / truth, truth, ALL, "gift", "inverse_depth")
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds, st.floats(0.01, 100), st.floats(-50, 50), st.sampled_from(list(PROTOCOLS)), st.sampled_from(KINDS))
+def test_metrics_do_not_change_under_affine_changes_in_the_fitted_space(seed, scale, shift, name, kind):
+    rules = PROTOCOLS[name]
+    if rules.dof == "none":
+        return
+    truth, values = scene(seed), np.random.default_rng([seed, 1]).uniform(1, 2, SHAPE)
+    changed = scale * values + abs(shift)
+    if rules.space == "inverse" and kind == "depth":  # what is fitted is its inverse
+        values, changed = 1 / values, 1 / changed
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        first, second = (
+            depth_metrics(align(p, truth, ALL, rules, kind).aligned, truth, ALL) for p in (values, changed)
+        )
+    assert second == pytest.approx(first, rel=1e-5, abs=1e-9)
 
 
 def test_protocols_state_their_choices():

@@ -13,6 +13,14 @@ from tiny import tiny_model, write_base, write_raw_tree
 torch.set_num_threads(1)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def cache_home(tmp_path_factory):
+    """Our caches (proxies of read-only datasets, groups at network size) stay out of the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("huggingface_hub.constants.HF_HOME", str(tmp_path_factory.mktemp("hf_home")))
+        yield
+
+
 @pytest.fixture
 def model():
     """A fresh tiny Depth Anything, float32, eval."""

@@ -96,7 +96,9 @@ def test_unknown_and_missing_arguments():
         ("adam_beta1", 1.0),
         ("adam_beta2", -0.1),
         ("adam_epsilon", 0.0),
-        ("group_cache_gb", float("inf")),
+        ("snapshot_micro_batch_size", 0),
+        ("snapshot_micro_batch_size", 4),  # with retain auto
+        ("profile", -1),
         ("lambda_c", float("inf")),
         ("lambda_d", -1.0),
         ("lambda_d", float("nan")),

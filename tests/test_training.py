@@ -1,5 +1,6 @@
 """A run from raw tree to adapter: what it computes, what it leaves on disk, and what it refuses."""
 
+import itertools
 import json
 import shutil
 
@@ -323,15 +324,19 @@ def test_the_order_is_a_permutation_of_seed_and_epoch():
     assert len({tuple(epoch_order(7, seed, epoch)) for seed in range(3) for epoch in range(3)}) == 9
 
 
-@pytest.mark.parametrize(("threads", "memory"), [(0, 0), (2, 0), (2, 2**30)])
-def test_prepared_groups_come_in_order_whatever_threads_and_cache(base_dir, tree, groups, run, threads, memory):
+@pytest.mark.parametrize(("threads", "cache"), [(0, False), (2, False), (2, True)])
+def test_prepared_groups_come_in_order_whatever_threads_and_cache(groups, run, threads, cache, tmp_path):
     plain = groups("train")
-    prepared = PreparedGroups(plain.dataset, plain.processor, plain.size, threads, memory)
+    prepared = PreparedGroups(plain.dataset, tiny_processor(), (56, 70), threads, tmp_path / "c" if cache else None)
     for order in ([2, 0, 1], [1, 2, 0]):
         taken = list(prepared.take(order))
         assert [group.group_id for group in taken] == [plain[index].group_id for index in order]
         assert all(torch.equal(group.target, plain[i].target) for group, i in zip(taken, order, strict=True))
-    assert (prepared[0] is prepared[0]) == bool(memory)
+        assert all(torch.equal(g.pixel_values, plain[i].pixel_values) for g, i in zip(taken, order, strict=True))
+    assert len(list(tmp_path.rglob("*.safetensors"))) == (3 if cache else 0)
+    endless = prepared.take(itertools.cycle([1, 0]))
+    assert [next(endless).group_id for _ in range(5)] == [plain[index].group_id for index in (1, 0, 1, 0, 1)]
+    endless.close()
 
 
 def test_optimizer_state_covers_the_trained_weights(run):

@@ -250,20 +250,33 @@ def to_pixel_values(images: Sequence[Image.Image], processor, size: tuple[int, i
     Keep-aspect and padding settings are ignored: `size` is final. Spelled out here because the torchvision backend,
     which transformers takes where torchvision is installed, has another bicubic.
     """
+    return normalize_pixels(resize_images(images, processor, size), processor)
+
+
+def resize_images(images: Sequence[Image.Image], processor, size: tuple[int, int]) -> np.ndarray:
+    """N RGB images to (N, 3, h, w) uint8 with the processor's filter."""
+    height, width = size
+    resample = Image.Resampling(pixel_settings(processor)["resample"])
+    return np.stack([np.asarray(image.resize((width, height), resample)).transpose(2, 0, 1) for image in images])
+
+
+def normalize_pixels(pixels: np.ndarray, processor) -> torch.Tensor:
+    """(N, 3, h, w) uint8 to float32 with the processor's scale, mean and std, looked up: there are 256 values."""
+    import cv2
     import torch
 
     settings = pixel_settings(processor)
-    height, width = size
-    arrays = []
-    for image in images:
-        array = np.asarray(image.resize((width, height), Image.Resampling(settings["resample"])))
-        if settings["rescale_factor"] is not None:
-            array = array.astype(np.float64) * settings["rescale_factor"]  # float64 first, as transformers does
-        array = array.astype(np.float32)
-        if settings["image_mean"] is not None:
-            array = (array - np.float32(settings["image_mean"])) / np.float32(settings["image_std"])
-        arrays.append(array.transpose(2, 0, 1))
-    return torch.from_numpy(np.ascontiguousarray(np.stack(arrays)))
+    levels = np.arange(256, dtype=np.uint8)
+    if settings["rescale_factor"] is not None:
+        levels = levels.astype(np.float64) * settings["rescale_factor"]  # float64 first, as transformers does
+    table = np.repeat(levels.astype(np.float32)[None], 3, axis=0)
+    if settings["image_mean"] is not None:
+        table = (table - np.float32(settings["image_mean"])[:, None]) / np.float32(settings["image_std"])[:, None]
+    values = torch.empty(pixels.shape, dtype=torch.float32)
+    for planes, target in zip(pixels, values.numpy(), strict=True):
+        for channel in range(3):
+            cv2.LUT(np.ascontiguousarray(planes[channel]), table[channel], dst=target[channel])
+    return values
 
 
 def resize_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -284,6 +297,19 @@ def collate_group(row: dict, processor, size: tuple[int, int]) -> Group:
     """
     import torch
 
+    group = to_group(row, resize_row(row, processor, size), processor, size)
+    group.depths = [
+        torch.from_numpy(np.asarray(depth).astype(np.float32)) for depth in row.get("depths") or []
+    ] or None
+    return group
+
+
+def resize_row(row: dict, processor, size: tuple[int, int]) -> dict[str, np.ndarray]:
+    """What of a decoded row depends on pixels, at size (h, w).
+
+    `images` (N, 3, h, w) uint8, `masks` (N, h, w) bool and, where the row has them, `valids` (N, h, w) bool and
+    `reference` (1, 3, h, w) uint8. Raises ValueError as `collate_group`.
+    """
     group_id, names = row["group_id"], list(row["image_names"])
     images = [to_rgb(*item) for item in label_items(group_id, names, "image", row["images"])]
     masks = [to_mask(*item) for item in label_items(group_id, names, "mask", row["masks"])]
@@ -292,25 +318,34 @@ def collate_group(row: dict, processor, size: tuple[int, int]) -> Group:
     reference = row.get("reference")
     reference = None if reference is None else to_rgb(reference, f"group {group_id}: the reference")
     check_group(group_id, names, images, masks, valids, depths, reference)
+    arrays = {"images": resize_images(images, processor, size), "masks": _stack_masks(masks, size)}
+    if valids:
+        arrays["valids"] = _stack_masks(valids, size)
+    if reference is not None:
+        arrays["reference"] = resize_images([reference], processor, size)
+    return arrays
+
+
+def to_group(row: dict, arrays: dict[str, np.ndarray], processor, size: tuple[int, int]) -> Group:
+    """A `Group` of a row's names and proxies, and what `resize_row` gives; ValueError for proxies of another size."""
+    import torch
+
     surface = row.get("surface")
     return Group(
-        group_id=group_id,
-        names=names,
-        pixel_values=to_pixel_values(images, processor, size),
-        mask=_stack_masks(masks, size),
-        valid=_stack_masks(valids, size) if valids else None,
-        target=_sized_proxies(row.get("proxies"), size, group_id),
-        reference_pixel_values=None if reference is None else to_pixel_values([reference], processor, size),
-        reference_target=_sized_proxies(row.get("reference_proxy"), size, group_id),
-        depths=[torch.from_numpy(depth.astype(np.float32)) for depth in depths] or None,
+        group_id=row["group_id"],
+        names=list(row["image_names"]),
+        pixel_values=normalize_pixels(arrays["images"], processor),
+        mask=torch.from_numpy(arrays["masks"]),
+        valid=torch.from_numpy(arrays["valids"]) if "valids" in arrays else None,
+        target=_sized_proxies(row.get("proxies"), size, row["group_id"]),
+        reference_pixel_values=normalize_pixels(arrays["reference"], processor) if "reference" in arrays else None,
+        reference_target=_sized_proxies(row.get("reference_proxy"), size, row["group_id"]),
         surface=SURFACES[surface] if isinstance(surface, int) else surface,
     )
 
 
-def _stack_masks(masks: Sequence[np.ndarray], size: tuple[int, int]) -> torch.Tensor:
-    import torch
-
-    return torch.from_numpy(np.stack([resize_mask(mask, size) for mask in masks]))
+def _stack_masks(masks: Sequence[np.ndarray], size: tuple[int, int]) -> np.ndarray:
+    return np.stack([resize_mask(mask, size) for mask in masks])
 
 
 def _sized_proxies(proxies, size: tuple[int, int], group_id: str) -> torch.Tensor | None:

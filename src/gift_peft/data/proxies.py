@@ -92,15 +92,19 @@ def default_proxies_dir(dataset: str | Path, teacher: str) -> Path:
 
 
 def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: torch.Tensor | None) -> None:
-    """Write one file, whole or not at all. Leftovers of a killed attempt on the same group are removed."""
+    """Write one file, whole or not at all."""
     import safetensors.torch
 
     tensors = {"proxies": proxies.float().contiguous()}
     if reference is not None:
         tensors["reference"] = reference.float().contiguous()
-    path.parent.mkdir(parents=True, exist_ok=True)
     # One entry, because safetensors writes several in random order, and equal proxies shall be equal files.
-    content = safetensors.torch.save(tensors, metadata={METADATA: json.dumps(header, sort_keys=True)})
+    write_whole(path, safetensors.torch.save(tensors, metadata={METADATA: json.dumps(header, sort_keys=True)}))
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file, whole or not at all, and remove what killed attempts at it left behind."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial")
     with open(partial, "wb") as file:
         file.write(content)
@@ -108,7 +112,7 @@ def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: to
         os.fsync(file.fileno())
     try:
         os.replace(partial, path)
-    except FileNotFoundError:  # another run made the same proxies at the same time and tidied up below
+    except FileNotFoundError:  # another run wrote the same at the same time and tidied up below
         if not path.exists():
             raise
     for leftover in path.parent.glob(f".{path.stem}.*.partial"):
@@ -178,8 +182,8 @@ class ProxyStore:
     expected: dict
     command: str
 
-    def read(self, row: dict) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """(proxies (N, h, w), reference (h, w) or None), float32, of a decoded row.
+    def read(self, row: dict, digests: dict | None = None) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """(proxies (N, h, w), reference (h, w) or None), float32, of a decoded row, or one of known `row_digests`.
 
         Raises FileNotFoundError for a missing file and ValueError for a stale, damaged or NaN one, naming it and the
         command that makes it again.
@@ -206,7 +210,7 @@ class ProxyStore:
                 raise ValueError(
                     f"NaN or infinite values in proxy {path} ({name}); make it again with `{self.command} --overwrite`"
                 )
-        reason = difference(header, {**self.expected, **row_digests(row)}, names)
+        reason = difference(header, {**self.expected, **(digests or row_digests(row))}, names)
         if reason:
             raise ValueError(f"stale proxy {path}: {reason}; make it again with `{self.command} --overwrite`")
         return tensors["proxies"], tensors.get("reference")

@@ -27,7 +27,9 @@ FREE_TO_CHANGE = {
     "max_steps",
     "retain",  # gradients do not depend on it, to the bit on CPU
     "dataloader_num_workers",
-    "group_cache_gb",
+    "group_cache_dir",
+    "gradient_checkpointing",  # recomputes the same bits
+    "profile",
     "checkpointing_steps",
     "checkpoints_total_limit",
     "checkpoint_at_steps",
@@ -74,6 +76,15 @@ class GiftTrainingArguments:
     lambda_d: float = _arg("weight of the self-distillation, Eq. 6; 0 collapses the depth", 1.0)
     micro_batch_size: int = _arg("images per forward; bounds the memory, not the gradient", 2)
     retain: str = _arg("images whose graphs are kept instead of replayed: 0 (the paper), a number, or auto", "auto")
+    snapshot_micro_batch_size: int | None = _arg(
+        "images per forward of snapshots that are replayed; default: micro_batch_size, other sizes change the bits",
+        None,
+    )
+    gradient_checkpointing: bool = _arg(
+        "recompute the blocks in the backward; smaller graphs, more are retained", False
+    )
+    compile: bool = _arg("torch.compile the encoder's blocks; changes the bits", False)
+    channels_last: bool = _arg("the head's convolutions in channels-last layout; changes the bits", False)
     num_train_epochs: int = _arg("passes over the groups, one update per group", 50)
     max_steps: int = _arg("stop after this many updates; -1: num_train_epochs decides", -1)
     learning_rate: float = _arg("Adam's learning rate, constant", 2e-5)
@@ -86,8 +97,11 @@ class GiftTrainingArguments:
     )
     seed: int = _arg("seed of the LoRA initialisation and of the order of the groups", 0)
     dataloader_num_workers: int = _arg("threads that decode and resize the next groups", 2)
-    group_cache_gb: float = _arg("memory per process for groups kept at network size between epochs", 4.0)
+    group_cache_dir: str | None = _arg(
+        "folder for groups at network size, shared by runs; default: gift-peft/groups in the Hugging Face cache", None
+    )
 
+    profile: int = _arg("time this many updates, print where the time goes, and stop", 0)
     checkpointing_steps: int | None = _arg("a checkpoint every so many updates; default: every epoch", None)
     checkpoints_total_limit: int | None = _arg("how many of the newest checkpoints are kept", 2)
     checkpoint_at_steps: list[int] = field(
@@ -118,10 +132,11 @@ class GiftTrainingArguments:
             "num_train_epochs",
             "checkpointing_steps",
             "checkpoints_total_limit",
+            "snapshot_micro_batch_size",
         ):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ValueError(f"{name}: must be at least 1, got {value}")
-        for name in ("lambda_c", "lambda_d", "weight_decay", "dataloader_num_workers", "group_cache_gb", "seed"):
+        for name in ("lambda_c", "lambda_d", "weight_decay", "dataloader_num_workers", "profile", "seed"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: must be finite and not negative, got {getattr(self, name)}")
         if self.retain != "auto" and self.retain < 0:
@@ -136,6 +151,8 @@ class GiftTrainingArguments:
             raise ValueError(f"seed: must be below 2**32, got {self.seed}")
         if any(step < 1 for step in self.checkpoint_at_steps):
             raise ValueError(f"checkpoint_at_steps: must be at least 1, got {min(self.checkpoint_at_steps)}")
+        if self.snapshot_micro_batch_size is not None and self.retain == "auto":
+            raise ValueError("snapshot_micro_batch_size: give retain as a number too, or results depend on the memory")
         self._check_recipe()
         if self.max_steps < 1 and self.max_steps != -1:
             raise ValueError(f"max_steps: must be at least 1, or -1, got {self.max_steps}")

@@ -1,19 +1,20 @@
 """The groups of an epoch, in its order, decoded and resized ahead of the step that needs them.
 
 An epoch's order is a permutation of (seed, epoch) alone, so a resumed run skips what it has done for free. A group is
-prepared once and kept at network size as far as the memory allows; threads prepare the next ones (Pillow and PyTorch
-release the interpreter lock), so that the step does not wait for decoding.
+decoded and resized once (`data/cache.py`); threads prepare the next ones (Pillow, OpenCV and PyTorch release the
+interpreter lock), so that the step does not wait.
 """
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from gift_peft.data.preprocess import Group, collate_group
+from gift_peft.data.cache import GroupCache
+from gift_peft.data.preprocess import Group
 
 
 def epoch_order(num_groups: int, seed: int, epoch: int) -> list[int]:
@@ -29,36 +30,30 @@ class PreparedGroups:
         dataset: rows with proxies, as `load_gift_i(..., teacher=...)` gives them.
         processor, size: as for `collate_group`.
         num_threads: groups prepared ahead; 0 prepares each when it is asked for.
-        cache_bytes: groups are kept until this is used up.
+        cache_dir: of `GroupCache`; None decodes every time.
     """
 
-    def __init__(self, dataset, processor, size: tuple[int, int], num_threads: int = 2, cache_bytes: int = 0) -> None:
+    def __init__(
+        self, dataset, processor, size: tuple[int, int], num_threads: int = 2, cache_dir: Path | None = None
+    ) -> None:
         self.dataset = dataset
-        self.processor = processor
-        self.size = size
         self.num_threads = num_threads
-        self.room = cache_bytes
-        self._cache: dict[int, Group] = {}
+        self._cache = GroupCache(dataset, processor, size, cache_dir)
 
     def __len__(self) -> int:
         return len(self.dataset)
 
     def __getitem__(self, index: int) -> Group:
-        """Errors of `collate_group`; ValueError if the row has no proxies."""
-        if index in self._cache:
-            return self._cache[index]
-        group = collate_group(self.dataset[index], self.processor, self.size)
+        """Errors of `GroupCache.read`; ValueError if the row has no proxies."""
+        group = self._cache.read(index)
         if group.target is None:
             raise ValueError(f"group {group.group_id} has no proxies")
-        group = replace(group, depths=None)  # true depths are for evaluation and stay out of training
-        size = sum(value.nbytes for value in vars(group).values() if isinstance(value, torch.Tensor))
-        if size <= self.room:
-            self.room -= size
-            self._cache[index] = group
+        if torch.cuda.is_available():  # a pinned tensor travels while the device computes
+            group.pixel_values = group.pixel_values.pin_memory()
         return group
 
-    def take(self, indices: Sequence[int]) -> Iterator[Group]:
-        """The groups of these indices, in this order."""
+    def take(self, indices: Iterable[int]) -> Iterator[Group]:
+        """The groups of these indices, in this order; there may be infinitely many."""
         if self.num_threads == 0:
             yield from (self[index] for index in indices)
             return

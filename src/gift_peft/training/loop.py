@@ -16,19 +16,23 @@ from accelerate import Accelerator
 from accelerate.utils import broadcast_object_list, set_seed
 
 from gift_peft.adapters import GiftRecipe, get_gift_model, get_recipe, save_adapter
+from gift_peft.data.cache import default_cache_dir
 from gift_peft.data.gift_i import dataset_fingerprint, gift_i_splits, load_gift_i, proxies_command
 from gift_peft.data.preprocess import Group, resolve_size
 from gift_peft.data.proxies import teacher_revision
+from gift_peft.evaluation.cards import model_card
 from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.layout import number
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.report import number, relative_change
 from gift_peft.evaluation.results import REGIONS, jsonable
+from gift_peft.evaluation.tables import relative_change
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import GeometryConsistencyError
 from gift_peft.training import card, checkpoints
 from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 from gift_peft.training.groups import PreparedGroups, epoch_order
 from gift_peft.training.progress import Progress
+from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
 from gift_peft.training.start import check_run, claim_folder, make_accelerator, stop_signals
 from gift_peft.training.state import State, write_metrics
 from gift_peft.training.teacher import load_teacher, make_proxies
@@ -111,15 +115,27 @@ class Run:
         # No DDP: GroupStep sums the gradients of a group over the processes itself, and autocasts itself, so that
         # validation and the proxies stay in float32. Eval mode: a replay must repeat its snapshot.
         self.model = model.to(accelerator.device).eval()
-        self.optimizer = torch.optim.Adam(
+        if args.gradient_checkpointing:
+            checkpoint_blocks(model)
+        if args.channels_last:
+            use_channels_last(model)
+        if args.compile:
+            compile_blocks(model)
+        self.optimizer = make_adam(
             [p for p in model.parameters() if p.requires_grad],
-            lr=args.learning_rate,
+            args.learning_rate,
             betas=(args.adam_beta1, args.adam_beta2),
             eps=args.adam_epsilon,
             weight_decay=args.weight_decay,
         )
         self.group_step = GroupStep(
-            self.model, args.lambda_c, args.lambda_d, args.micro_batch_size, args.retain, accelerator
+            self.model,
+            args.lambda_c,
+            args.lambda_d,
+            args.micro_batch_size,
+            args.retain,
+            accelerator,
+            args.snapshot_micro_batch_size,
         )
 
     def _data(self) -> tuple[PreparedGroups, PreparedGroups | None]:
@@ -136,13 +152,13 @@ class Run:
         splits = gift_i_splits(args.dataset_name)
         if "train" not in splits:
             raise ValueError(f"dataset_name: {args.dataset_name} has no train split")
-        memory = args.group_cache_gb * 2**30
-        share = {"train": 0.75, "validation": 0.25} if "validation" in splits else {"train": 1}
+        cache_dir = Path(args.group_cache_dir) if args.group_cache_dir else default_cache_dir()
         groups = {}
-        for split, part in share.items():
-            rows = load_gift_i(args.dataset_name, split, teacher=args.model_name_or_path, **places)
-            threads = args.dataloader_num_workers
-            groups[split] = PreparedGroups(rows, self.processor, self.size, threads, int(part * memory))
+        for split in ("train", "validation"):
+            if split in splits:
+                rows = load_gift_i(args.dataset_name, split, teacher=args.model_name_or_path, **places)
+                threads = args.dataloader_num_workers
+                groups[split] = PreparedGroups(rows, self.processor, self.size, threads, cache_dir)
         return groups["train"], groups.get("validation")
 
     def _identity(self) -> dict:
@@ -153,6 +169,8 @@ class Run:
         fingerprint = [None]
         if self.accelerator.is_main_process:
             fingerprint = ["-".join(dataset_fingerprint(groups.dataset) for groups in parts)]
+        if args.snapshot_micro_batch_size:
+            identity["retain"] = args.retain  # decides which snapshots come from larger forwards
         return identity | {
             "model_name_or_path": teacher_revision(args.model_name_or_path, args.model_revision),
             "dataset_name": broadcast_object_list(fingerprint)[0],
@@ -175,12 +193,15 @@ class Run:
         return text + (f"\nGoing on from {checkpoint} (step {state.step})" if checkpoint else "")
 
     def groups_from(self, step: int) -> Iterator[Group]:
-        """The groups of all updates after `step`."""
-        while True:
+        """The groups of all updates after `step`, prepared ahead across epochs."""
+
+        def order() -> Iterator[int]:
             epoch, done = divmod(step, self.epoch_steps)
-            order = epoch_order(self.epoch_steps, self.args.seed, epoch)[done:]
-            yield from self.train_groups.take(order)
-            step += len(order)
+            while True:
+                yield from epoch_order(self.epoch_steps, self.args.seed, epoch)[done:]
+                epoch, done = epoch + 1, 0
+
+        return self.train_groups.take(order())
 
     def agree(self, signum: int) -> int:
         """The signal to stop by, if any process has received one, on all of them."""
@@ -347,7 +368,7 @@ class Run:
                 processor=self.processor,
                 size=self.size,
                 gift=record,
-                card=card.model_card(self.args, record) if with_card else None,
+                card=model_card(asdict(self.args), record) if with_card else None,
             )
 
 

@@ -1,0 +1,79 @@
+"""The same step, faster or in less memory: one optimizer kernel, compiled or recomputed blocks, channels-last heads.
+
+Recomputing gives the same bits, compiling and channels-last do not: they are for those who ask.
+"""
+
+from collections.abc import Iterable, Iterator
+from functools import partial
+
+import torch
+from peft import PeftModel
+from peft.tuners.lora import LoraLayer
+from peft.utils.other import ModulesToSaveWrapper
+from torch import nn
+from torch.utils.checkpoint import checkpoint
+from transformers.modeling_layers import GradientCheckpointingLayer
+
+FUSED_DEVICES = ("cpu", "cuda", "mps", "xpu")  # where PyTorch's Adam has one kernel for all weights
+
+
+def make_adam(weights: Iterable[nn.Parameter], learning_rate: float, **options) -> torch.optim.Adam:
+    """Adam, fused where the weights' device has that; `options` as PyTorch's."""
+    weights = list(weights)
+    return torch.optim.Adam(weights, lr=learning_rate, fused=weights[0].device.type in FUSED_DEVICES, **options)
+
+
+def encoder_blocks(model: PeftModel) -> list[GradientCheckpointingLayer]:
+    """The transformer blocks that hold LoRA; ValueError if the architecture's blocks are not marked as such."""
+    blocks = [
+        module
+        for module in model.modules()
+        if isinstance(module, GradientCheckpointingLayer)
+        and any(isinstance(part, LoraLayer) for part in module.modules())
+    ]
+    if not blocks:
+        raise ValueError(
+            f"{type(model.get_base_model()).__name__} has no block that is a transformers GradientCheckpointingLayer, "
+            "which compile and gradient_checkpointing need"
+        )
+    return blocks
+
+
+def compile_blocks(model: PeftModel) -> None:
+    """`torch.compile` each encoder block, in place; equal blocks share what is compiled. Names do not change."""
+    for block in encoder_blocks(model):
+        block.compile()
+
+
+def checkpoint_blocks(model: PeftModel) -> None:
+    """Keep only the inputs of each encoder block and run it again in the backward.
+
+    Not reentrant: that would drop the gradients of blocks whose input needs none. transformers checkpoints in training
+    mode only, so that flag is set, on the blocks alone: what is inside stays in eval mode.
+    """
+    for block in encoder_blocks(model):
+        block.gradient_checkpointing = True
+        block._gradient_checkpointing_func = partial(checkpoint, use_reentrant=False)
+        block.training = True
+
+
+def use_channels_last(model: PeftModel) -> None:
+    """Hand each convolution of the trained head its input in channels-last layout, which the rest then follows.
+
+    The inputs and not the weights, so that gradients, optimizer and files keep their layout. The teacher's frozen head
+    keeps its bits.
+    """
+    for head in _trained_heads(model):
+        for module in head.modules():
+            if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+                module.register_forward_pre_hook(_channels_last_input)
+
+
+def _trained_heads(model: PeftModel) -> Iterator[nn.Module]:
+    for module in model.modules():
+        if isinstance(module, ModulesToSaveWrapper):
+            yield from module.modules_to_save.values()
+
+
+def _channels_last_input(module: nn.Module, args: tuple) -> tuple:
+    return args[0].contiguous(memory_format=torch.channels_last), *args[1:]

@@ -34,6 +34,7 @@ FREE_TO_CHANGE = {
     "checkpoints_total_limit",
     "checkpoint_at_steps",
     "resume_from_checkpoint",
+    "booster_root",
     "report_to",
     "license",
     "push_to_hub",
@@ -110,6 +111,7 @@ class GiftTrainingArguments:
     resume_from_checkpoint: str | None = _arg(
         "a checkpoint-<step> folder, or latest: the newest complete one in output_dir", None
     )
+    booster_root: str | None = _arg("Booster's folder: ToM and Other RMSE on it after every epoch", None)
     report_to: Literal["none", "tensorboard", "trackio"] = _arg("experiment tracker", "none")
     license: str | None = _arg("licence named in the card; default: the base model's where known", None)
     push_to_hub: bool = _arg("upload the adapter when training has ended (token: hf auth login)", False)

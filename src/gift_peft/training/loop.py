@@ -16,10 +16,12 @@ from accelerate import Accelerator
 from accelerate.utils import broadcast_object_list, set_seed
 
 from gift_peft.adapters import GiftRecipe, get_gift_model, get_recipe, save_adapter
+from gift_peft.data.booster import find_booster
 from gift_peft.data.cache import default_cache_dir
 from gift_peft.data.gift_i import dataset_fingerprint, gift_i_splits, load_gift_i, proxies_command
 from gift_peft.data.preprocess import Group, resolve_size
 from gift_peft.data.proxies import teacher_revision
+from gift_peft.evaluation.booster import evaluate_booster
 from gift_peft.evaluation.cards import model_card
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.layout import number
@@ -31,6 +33,7 @@ from gift_peft.losses import GeometryConsistencyError
 from gift_peft.training import card, checkpoints
 from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 from gift_peft.training.groups import PreparedGroups, epoch_order
+from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
 from gift_peft.training.start import check_run, claim_folder, make_accelerator, stop_signals
@@ -66,6 +69,9 @@ def train(args: GiftTrainingArguments) -> TrainResult:
     accelerator = make_accelerator(args)
     output, checkpoint = check_run(args, accelerator)
     run = Run(args, output, accelerator)
+    if args.profile:
+        accelerator.print(profile_updates(run, args.profile))
+        return TrainResult(output, 0, [], None)
     state = run.restore(checkpoint) if checkpoint else State()
     claim_folder(args, accelerator, fresh=checkpoint is None)
     if args.report_to != "none":
@@ -73,6 +79,7 @@ def train(args: GiftTrainingArguments) -> TrainResult:
     progress = Progress(run.total_steps, state.step, accelerator.is_main_process)
     progress.say(run.describe(state, checkpoint))
     feed = run.groups_from(state.step)
+    first = state.step + 1
     try:
         with stop_signals() as stop:
             while not (signum := run.agree(stop.signum)):
@@ -82,6 +89,8 @@ def train(args: GiftTrainingArguments) -> TrainResult:
                 if state.step >= run.total_steps:
                     break
                 progress.step(*run.update(next(feed), state))
+                if state.step == first and run.group_step.budget is not None:
+                    progress.say(str(run.group_step.budget))
             if signum:
                 run.save_checkpoint(state)
     finally:
@@ -100,6 +109,8 @@ class Run:
 
     def __init__(self, args: GiftTrainingArguments, output: Path, accelerator: Accelerator) -> None:
         self.args, self.output, self.accelerator = args, output, accelerator
+        if args.booster_root is not None:
+            find_booster(args.booster_root)  # what is wrong with it is said before the proxies are made
         # Float32 weights whatever the checkpoint's: bf16 is autocast's business (paper, implementation details).
         base, self.processor = load_teacher(args.model_name_or_path, args.model_revision)
         self.recipe, self.kind = _recipe(args, base)
@@ -240,7 +251,7 @@ class Run:
         """Validate, write the row, keep the adapter if it is the best so far, write the checkpoint if it is due."""
         if state.step == 0:
             self._measure_base(state)
-        row = state.close_epoch(self.epoch_steps) | self._validate()
+        row = state.close_epoch(self.epoch_steps) | self._validate() | self._measure_booster()
         row = {key: jsonable(value) for key, value in row.items()}
         state.rows.append(row)
         best = state.row_of(state.best_step)
@@ -279,6 +290,22 @@ class Run:
         )
         values = {f"val_{r}_{m}": report.summary[r][m] for r in REGIONS for m in METRICS}
         return {"val_gce": report.gce["adapted"], **values}
+
+    def _measure_booster(self) -> dict:
+        """RMSE in mm on Booster (protocol `gift`, a quarter of its size), where a root is given."""
+        if self.args.booster_root is None:
+            return {}
+        report = evaluate_booster(
+            self.args.booster_root,
+            self.model,
+            kind=self.kind,
+            processor=self.processor,
+            size=self.size,
+            baseline=False,
+            accelerator=self.accelerator,
+            progress=False,
+        )
+        return {f"booster_{region}_rmse": report.summary[region]["rmse"] for region in ("tom", "other")}
 
     def _checkpoint_is_due(self, step: int) -> bool:
         every = self.args.checkpointing_steps or self.epoch_steps

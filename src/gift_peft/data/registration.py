@@ -1,0 +1,297 @@
+"""Registration of a group's frames to its last observation: the paper's numbers, made safe (supplement A).
+
+The paper's steps (`matching.py`) by themselves accept homographies of five matches that move a corner by 200,000 px.
+Here a frame is warped only if enough matches outside the target agree, they fix the map at the target's corners, the
+map is a small motion, and the warped frame fits better outside the target than it did before. A frame whose camera
+did not move is not resampled at all.
+"""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from gift_peft.data.homography import Fit, corners_of, displacement, distortion, fit_pixels, transform
+from gift_peft.data.matching import Frame, Matches, RegistrationSettings, find_homography, match_frames
+
+
+@dataclass
+class Registration:
+    """What was decided about a frame, and why.
+
+    Args:
+        status (`str`): "identity" (leave the pixels alone), "warped", or "dropped".
+        matrix (`np.ndarray`, *optional*): (3, 3), frame to target frame, pixels; None if dropped.
+        method (`str`): "declared static", "features" or "pixels".
+        reasons (`list[dict]`): {"code", "text"}, why it was dropped.
+        warnings (`list[dict]`): likewise, what to look at although it was not.
+        figures (`dict`): what was measured (`captures.py` lists the keys).
+    """
+
+    status: str
+    matrix: np.ndarray | None = None
+    method: str = "features"
+    reasons: list[dict] = field(default_factory=list)
+    warnings: list[dict] = field(default_factory=list)
+    figures: dict = field(default_factory=dict)
+
+
+def register(moving: Frame, fixed: Frame, declared_static: bool = False, treated: bool = False) -> Registration:
+    """Decide whether `moving` stays as it is, is warped onto `fixed`, or is dropped.
+
+    Deterministic. `treated`: the frame is the surface-treated reference. Its look differs by design, so the pixels
+    outside the target may stand in for the 90 % rule, with a warning.
+    """
+    settings = fixed.settings
+    if declared_static:
+        return Registration("identity", np.eye(3), "declared static")
+    tries = []
+    for contrast in _contrasts(settings):
+        tries.append(match_frames(moving, fixed, contrast))
+        if _sure(tries[-1], fixed):
+            break
+    enough = [match for match in tries if not _weak(match, fixed)]
+    best = max(enough, key=lambda match: (match.inlier_ratio >= settings.min_inlier_ratio, match.count), default=None)
+    if best is None:
+        result = Registration("dropped", reasons=_diagnose(tries, fixed), figures=_figures(tries[-1], fixed))
+    else:
+        result = _decide(best, moving, fixed, treated)
+    if result.status == "dropped" and result.reasons[0]["code"] != "moved_too_far":
+        by_pixels = _identity_by_pixels(moving, fixed)
+        if by_pixels is not None:
+            warnings = [reason("by_pixels", "too few matches agree; the pixels outside the target show no motion")]
+            result = Registration("identity", np.eye(3), "pixels", [], warnings, result.figures | by_pixels)
+    paper = _paper_verdict(moving, fixed)
+    result.figures["paper_exact"] = {key: value for key, value in paper.items() if key != "matrix"}
+    return _by_the_paper(paper, result) if settings.paper_exact else result
+
+
+def _decide(match: Matches, moving: Frame, fixed: Frame, treated: bool) -> Registration:
+    """From matches that determine a map: identity, or the warp if nothing speaks against it."""
+    settings = fixed.settings
+    fit = _refine(match, moving, fixed)
+    matrix = np.linalg.inv(fit.matrix)
+    frame_corners = corners_of(*fixed.size)
+    error, moved = fit.expected_error(fixed.corners), displacement(fit.matrix, fixed.corners)
+    corner, bent = displacement(fit.matrix, frame_corners), distortion(fit.matrix, frame_corners)
+    before, after = difference_outside(moving, fixed, matrix)
+    figures = _figures(match, fixed) | {
+        "expected_error": error,
+        "corner_displacement": corner,
+        "target_displacement": moved,
+        "difference_before": before,
+        "difference_after": after,
+    }
+    # A turn about a point among the features moves them little and a target far from it much. That is believed only
+    # when the pixels bear it out: the map alone moves corners of frames whose camera stood still.
+    hidden = moved - 2 * error > settings.identity_displacement and after < 0.97 * before
+    if match.median_displacement < settings.identity_displacement and not hidden:
+        return Registration("identity", np.eye(3), figures=figures)
+    bound = settings.max_displacement * float(np.hypot(*fixed.size))
+    ratio = match.inlier_ratio
+    checks = [
+        (
+            max(corner, moved) > bound,
+            "moved_too_far",
+            f"a corner moves by {max(corner, moved):.1f} px, bound {bound:.1f}",
+        ),
+        (
+            bent > settings.max_distortion,
+            "distorted",
+            f"lengths change by {100 * bent:.1f} %, bound {100 * settings.max_distortion:.1f} %",
+        ),
+        (
+            ratio < settings.min_inlier_ratio,
+            "low_inlier_ratio",
+            f"{match.count} of {match.near.sum()} matches agree ({100 * ratio:.0f} %), "
+            f"{100 * settings.min_inlier_ratio:.0f} % needed",
+        ),
+        (
+            error > settings.max_target_error,
+            "uncertain",
+            f"the map may be {error:.2f} px off at the target's corners, bound {settings.max_target_error}",
+        ),
+        (
+            fit.correlation < settings.min_correlation,
+            "no_match",
+            f"the pictures outside the target correlate by {fit.correlation:.2f}, {settings.min_correlation} needed",
+        ),
+        (
+            not after <= before,
+            "worse_outside",
+            f"warping would raise the difference outside the target from {before:.2f} to {after:.2f}",
+        ),
+    ]
+    reasons = [reason(code, text) for failed, code, text in checks if failed]
+    warnings = []
+    if treated and fit is not match.fit and [item["code"] for item in reasons] == ["low_inlier_ratio"]:
+        warnings, reasons = reasons, []
+    if reasons:
+        return Registration("dropped", reasons=reasons, figures=figures)
+    return Registration("warped", matrix, "pixels" if warnings else "features", [], warnings, figures)
+
+
+def _paper_verdict(moving: Frame, fixed: Frame) -> dict:
+    """What the paper's numbers alone say, features inside the target included."""
+    settings = fixed.settings
+    match = match_frames(moving, fixed, settings.contrast_threshold, outside_only=False)
+    accepted = match.matrix is not None and match.inlier_ratio >= settings.min_inlier_ratio
+    return {
+        "accepted": bool(accepted and abs(np.linalg.det(match.matrix)) > 1e-9),
+        "matches": int(match.near.sum()),
+        "inliers": match.count,
+        "inlier_ratio": match.inlier_ratio,
+        "corner_displacement": None if match.matrix is None else displacement(match.matrix, corners_of(*fixed.size)),
+        "matrix": match.matrix,
+    }
+
+
+def _by_the_paper(paper: dict, ours: Registration) -> Registration:
+    figures = ours.figures | {"with_additions": {"status": ours.status, "reasons": ours.reasons}}
+    if paper["accepted"]:
+        return Registration("warped", paper["matrix"], figures=figures)
+    ratio = paper["inlier_ratio"]
+    text = f"{paper['inliers']} of {paper['matches']} matches agree" + (
+        "" if ratio is None else f" ({100 * ratio:.0f} %)"
+    )
+    return Registration("dropped", reasons=[reason("low_inlier_ratio", text)], figures=figures)
+
+
+def reason(code: str, text: str) -> dict:
+    return {"code": code, "text": text}
+
+
+def _contrasts(settings: RegistrationSettings) -> list[float]:
+    """The paper's threshold, halved down to the floor."""
+    contrasts = [settings.contrast_threshold]
+    while contrasts[-1] / 2 >= settings.min_contrast_threshold:
+        contrasts.append(contrasts[-1] / 2)
+    return contrasts
+
+
+def _weak(match: Matches, fixed: Frame) -> list[dict]:
+    """Why the matches do not determine a map at all, [] if they do."""
+    settings = fixed.settings
+    if match.count < settings.min_inliers:
+        return [reason("no_match", f"{match.count} matches agree, {settings.min_inliers} needed")]
+    spread = match.spread
+    if match.fit is None or spread < settings.min_spread:
+        return [
+            reason(
+                "narrow", f"the agreeing matches spread over {spread:.3f} of the frame, {settings.min_spread} needed"
+            )
+        ]
+    return []
+
+
+def _sure(match: Matches, fixed: Frame) -> bool:
+    """Whether a lower contrast threshold, with more matches, has nothing to add."""
+    settings = fixed.settings
+    return (
+        not _weak(match, fixed)
+        and match.inlier_ratio >= settings.min_inlier_ratio
+        and match.fit.expected_error(fixed.corners) <= settings.max_target_error
+    )
+
+
+def _diagnose(tries: list[Matches], fixed: Frame) -> list[dict]:
+    """Of matches that are all weak, the reason that helps: little texture, too large a motion, or no agreement."""
+    settings = fixed.settings
+    for count, which in zip(tries[-1].features, ("frame", "target frame"), strict=True):
+        if count < settings.min_inliers:
+            text = f"the {which} has {count} features outside the target, too little texture"
+            return [reason("featureless", f"{text}; if the camera stood still, put static_rig: true in group.yaml")]
+    bound = settings.max_displacement * float(np.hypot(*fixed.size))
+    for match in tries:
+        if len(match.fixed) < 8:
+            continue
+        matrix, inliers = find_homography(match.moving, match.fixed, settings)  # without the displacement filter
+        if matrix is not None and inliers.sum() >= max(8, 0.6 * len(inliers)):
+            moved = displacement(matrix, fixed.corners)
+            if moved > bound:
+                return [reason("moved_too_far", f"the target moves by about {moved:.0f} px, bound {bound:.1f}")]
+    return _weak(tries[-1], fixed)
+
+
+def _refine(match: Matches, moving: Frame, fixed: Frame) -> Fit:
+    """The fit to the matches, or the one to the pixels from there, where that is surer and the matches bear it out."""
+    by_pixels = fit_pixels(fixed.levels, moving.levels, match.fit.matrix)
+    if by_pixels is None:
+        return match.fit
+    by_points = match.fit
+    here, there = match.fixed[match.agreeing], match.moving[match.agreeing]
+    residual = [
+        np.median(np.linalg.norm(transform(fit.matrix, here) - there, axis=1)) for fit in (by_points, by_pixels)
+    ]
+    surer = by_pixels.expected_error(fixed.corners) < by_points.expected_error(fixed.corners)
+    return by_pixels if surer and residual[1] < 1.2 * residual[0] + 0.1 else by_points
+
+
+def _identity_by_pixels(moving: Frame, fixed: Frame) -> dict | None:
+    """Figures of the pixels outside the target if they say that the camera did not move, else None."""
+    settings = fixed.settings
+    fit = fit_pixels(fixed.levels, moving.levels, np.eye(3))
+    if fit is None or fit.correlation < settings.min_correlation:
+        return None
+    error, moved = fit.expected_error(fixed.corners), displacement(fit.matrix, fixed.corners)
+    if error > settings.max_target_error or moved > settings.identity_displacement:
+        return None
+    return {"expected_error": error, "target_displacement": moved}
+
+
+def difference_outside(moving: Frame, fixed: Frame, matrix: np.ndarray) -> tuple[float, float]:
+    """Mean absolute grey difference (0-255) outside both targets, before and after the warp, over the same pixels.
+
+    Gain and offset between the pictures are fitted away each time: a lamp that was dimmed is not a difference.
+    """
+    valid = valid_area(matrix, fixed.size)
+    warped = cv2.warpPerspective(moving.gray, matrix, fixed.size, flags=cv2.INTER_LINEAR)
+    outside = cv2.warpPerspective(moving.outside.astype(np.uint8), matrix, fixed.size, flags=cv2.INTER_NEAREST) > 0
+    region = fixed.outside & moving.outside & outside & valid
+    return tuple(_difference(picture[region], fixed.gray[region]) for picture in (moving.gray, warped))
+
+
+def _difference(values: np.ndarray, goal: np.ndarray) -> float:
+    if not values.size:
+        return float("nan")
+    values, goal = values.astype(np.float64), goal.astype(np.float64)
+    deviation = values.std()
+    gain = np.mean((values - values.mean()) * (goal - goal.mean())) / deviation**2 if deviation > 0 else 0.0
+    return float(np.abs(goal - goal.mean() - gain * (values - values.mean())).mean())
+
+
+def valid_area(matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool: where the warped frame has pixels, that is, all that linear interpolation asks for."""
+    width, height = size
+    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    inverse = np.linalg.inv(matrix)
+    scale = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
+    u = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / scale
+    v = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / scale
+    return (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1) & (scale > 0)
+
+
+def warp(array: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 3) uint8 linearly, anything else (masks, depth; (H, W)) by the nearest pixel.
+
+    Beyond its border a picture repeats its last pixels, a black wedge would be one more object for a network to see;
+    masks and depth have 0 there.
+    """
+    height, width = array.shape[:2]
+    if array.ndim == 3:
+        return cv2.warpPerspective(
+            array, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+    stored = array.astype(np.uint8) if array.dtype == bool else array
+    return cv2.warpPerspective(stored, matrix, (width, height), flags=cv2.INTER_NEAREST).astype(array.dtype)
+
+
+def _figures(match: Matches, fixed: Frame) -> dict:
+    return {
+        "contrast_threshold": match.contrast,
+        "matches": int(match.near.sum()),
+        "inliers": match.count,
+        "inlier_ratio": match.inlier_ratio,
+        "spread": match.spread if match.count else None,
+        "median_displacement": match.median_displacement,
+    }

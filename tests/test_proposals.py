@@ -234,4 +234,4 @@ def test_the_measuring_example(tmp_path, monkeypatch, capsys):
     runpy.run_path(str(script), run_name="__main__")
     line, mean = capsys.readouterr().out.splitlines()
     assert line.startswith("scene") and mean.startswith("1 groups: mean IoU 0.")
-    assert float(mean.split()[-1]) > 0.8
+    assert float(mean.split()[-1]) > 0.7

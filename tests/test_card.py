@@ -1,6 +1,7 @@
 """The card a run writes is a valid one, tells what was measured, and holds no path; the upload gets five files."""
 
 import json
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import huggingface_hub
@@ -9,10 +10,12 @@ from huggingface_hub import ModelCard
 from runs import arguments, train_again
 from tiny import write_raw_tree
 
+from gift_peft.evaluation import cards
+from gift_peft.evaluation.metrics import METRICS
 from gift_peft.training import GiftTrainingArguments, card, loop, start, train
 
 ROW = {"step": 0, "epoch": 0, "val_gce": 0.5} | {
-    f"val_{region}_{metric}": 0.25 for region in ("tom", "other", "all") for metric in card.METRICS
+    f"val_{region}_{metric}": 0.25 for region in ("tom", "other", "all") for metric in METRICS
 }
 RECORD = {
     "model_type": "depth_anything",
@@ -29,7 +32,7 @@ RECORD = {
 def make(tmp_path, adapted, **changes):
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out", **changes)
     record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
-    (tmp_path / "README.md").write_text(card.model_card(args, record))
+    (tmp_path / "README.md").write_text(cards.model_card(asdict(args), record))
     return ModelCard.load(tmp_path / "README.md")
 
 
@@ -51,12 +54,12 @@ def test_metadata_on_the_hub(tmp_path):
 
 def test_a_licence_may_be_stated(tmp_path):
     assert make(tmp_path, ROW, license="mit").data.license == "mit"
-    assert card.base_license("someone/unknown") == "other"
+    assert cards.base_license("someone/unknown") == "other"
     (tmp_path / "README.md").write_text("---\nlicense: bsd-2-clause\n---\n")
-    assert card.base_license(str(tmp_path)) == "bsd-2-clause"
+    assert cards.base_license(str(tmp_path)) == "bsd-2-clause"
     for broken in (b"---\nlicense: [a\n: b\n---\n", b"---\nlicense: \xff\n---\n"):
         (tmp_path / "README.md").write_bytes(broken)
-        assert card.base_license(str(tmp_path)) == "other"
+        assert cards.base_license(str(tmp_path)) == "other"
 
 
 def test_without_validation_nothing_is_claimed(tmp_path):
@@ -162,8 +165,8 @@ def test_push_is_checked_before_anything_is_loaded(base_dir, tree, tmp_path, mon
 )
 def test_hub_ids_and_paths(name, local, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert card.is_local(name) is local
+    assert cards.is_local(name) is local
     (tmp_path / "model").mkdir()
-    assert card.is_local("model")
-    assert card.portable_name("owner/model") == "owner/model"
-    assert card.portable_name(str(tmp_path / "model")) == "model"
+    assert cards.is_local("model")
+    assert cards.portable_name("owner/model") == "owner/model"
+    assert cards.portable_name(str(tmp_path / "model")) == "model"

@@ -15,10 +15,11 @@ from gift_peft.adapters import get_gift_model
 from gift_peft.data.gift_i import load_gift_i
 from gift_peft.data.preprocess import Group
 from gift_peft.data.writer import write_gift_i
-from gift_peft.evaluation.evaluate import evaluate_gift_i, make_panel, run_evaluation
-from gift_peft.evaluation.report import text_table
+from gift_peft.evaluation.evaluate import evaluate_gift_i, run_evaluation
+from gift_peft.evaluation.panels import group_panels
 from gift_peft.evaluation.results import REGIONS, GiftIReport
 from gift_peft.evaluation.scoring import consensus
+from gift_peft.evaluation.tables import text_table
 from gift_peft.training.teacher import make_proxies
 
 H, W = 6, 8
@@ -510,13 +511,14 @@ def test_paths_and_model_ids_are_accepted(raw_tree, base_dir, tmp_path):
 def test_panels_hold_an_observation_on_the_reference_grid(tmp_path):
     dataset, depths = depth_tree(tmp_path, (30, 40))
     options = {"processor": tiny_processor(), "size": SIZE, "kind": "inverse_depth"}
-    panel = make_panel(dataset[0], 1, tiny_model(1), tiny_model(), label="mirror", **options)
+    (panel,) = group_panels(dataset[0], {1: "mirror"}, tiny_model(1), tiny_model(), **options)
+    assert panel.label == "mirror"
     assert panel.base.shape == panel.adapted.shape == panel.target.shape == (30, 40)
     np.testing.assert_array_equal(panel.reference, depths[1])
     assert panel.image.size == (40, 30) and panel.target.sum() == 26 * 36 and panel.protocol == "gift"
     assert not np.array_equal(panel.base, panel.adapted)
     with pytest.raises(ValueError, match="group g has no proxy"):
-        make_panel(dataset[0], 0, tiny_model(1), tiny_model(), label="x", reference="proxy", **options)
+        group_panels(dataset[0], {0: "x"}, tiny_model(1), tiny_model(), reference="proxy", **options)
 
 
 CLEARGRASP = Path(__file__).parents[2] / "shared" / "data" / "cleargrasp_d435"

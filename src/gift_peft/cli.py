@@ -45,7 +45,7 @@ def _parser() -> argparse.ArgumentParser:
 
     def verb(name, run, text, **options):
         sub = verbs.add_parser(name, parents=[debug], help=text, description=text, allow_abbrev=False, **options)
-        sub.set_defaults(run=run)
+        sub.set_defaults(run=run, usage_error=sub.error)
         return sub
 
     demo = verb(
@@ -64,20 +64,49 @@ def _parser() -> argparse.ArgumentParser:
     # Its own parser knows the arguments (`gift-peft train --help`).
     verb("train", _train, "fine-tune a model on groups of images into an adapter", add_help=False)
 
-    evaluate = verb("evaluate", _evaluate, "compare base and adapter on validation groups")
-    _add_model_and_data(evaluate)
+    evaluate = verb("evaluate", _evaluate, "compare base and adapter on validation groups, or on Booster")
+    _add_model(evaluate, required=False)
+    evaluate.add_argument("--dataset", help="GIFT-I: raw tree, prepared folder, parquet release or hub id")
     _add_adapter(evaluate)
     evaluate.add_argument("--dataset_revision", help="branch, tag or commit of a hub dataset")
     evaluate.add_argument("--split", default="validation")
     evaluate.add_argument("--reference", choices=["proxy", "depth"], default="proxy", help="what to compare with")
     evaluate.add_argument("--protocol", help="default: native against proxies, gift against depth")
+    evaluate.add_argument("--list-protocols", action=_ListProtocols, help="print what each does, and its source")
+    evaluate.add_argument("--prediction_scale", type=float, help="to mm, for protocols that fit no scale")
     evaluate.add_argument("--out", default="evaluation", help="folder for metrics.json, rows.jsonl, report.md")
+    booster = evaluate.add_argument_group("Booster")
+    booster.add_argument("--booster", metavar="ROOT", help="evaluate on Booster instead of GIFT-I")
+    booster.add_argument("--predictions", metavar="DIR", help="stored predictions in place of --base")
+    booster.add_argument("--resize", type=float, default=0.25, help="of the ground truth (default: 0.25)")
+    booster.add_argument("--occlusion", choices=["all", "noc"], default="all", help="noc: what both cameras see")
+    booster.add_argument("--subset", choices=["balanced", "unbalanced"], help="default: balanced, else what there is")
+    booster.add_argument("--partial", action="store_true", help="an incomplete official set is wanted as it is")
 
     predict = verb("predict", _predict, "depth of pictures, beside the base's")
     predict.add_argument("images", nargs="+", metavar="IMAGE", help="picture files or folders of them")
     _add_model(predict)
     _add_adapter(predict)
     predict.add_argument("--out", required=True, help="folder for the npy and png files")
+    report = verb("report", _report, "tables, figures and model card of runs, from what they left behind")
+    report.add_argument("runs", nargs="+", metavar="RUN", help="folder of a run or of an evaluation")
+    report.add_argument("--out", help="default: RUN/report, for several runs ./report")
+    report.add_argument(
+        "--model-card",
+        "--model_card",
+        nargs="?",
+        const=True,
+        metavar="FILE",
+        help="also write the model card (default: OUT/model_card.md); RUN may then be the YAML file of a run to come",
+    )
+    report.add_argument("--panels", type=int, default=3, help="rows of the before/after figure; 0: no pictures")
+    report.add_argument(
+        "--zero-shot", "--zero_shot", nargs="+", default=[], metavar="IMAGE", help="pictures for base and checkpoints"
+    )
+    report.add_argument(
+        "--steps", type=int, nargs="+", default=[], help="checkpoints of --zero-shot; default: kept ones"
+    )
+
     convert = verb("convert", _convert, "official VGGT or Metric3D V2 weights to a transformers folder")
     convert.add_argument("architecture", choices=["vggt", "metric3d"])
     convert.add_argument(
@@ -90,8 +119,21 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_model(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--base", required=True, help="base model: hub id or folder")
+class _ListProtocols(argparse.Action):
+    """Prints the protocols and ends, whatever else is asked for."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, nargs=0, **kwargs)
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        from gift_peft.evaluation.protocols import list_protocols
+
+        print(list_protocols())
+        parser.exit()
+
+
+def _add_model(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    parser.add_argument("--base", required=required, help="base model: hub id or folder")
     parser.add_argument("--revision", help="branch, tag or commit of the base model")
     parser.add_argument("--size", metavar="HxW", help="at the network; default: the adapter's, else the recipe's")
 
@@ -106,7 +148,7 @@ def _add_model_and_data(parser: argparse.ArgumentParser) -> None:
 def _add_adapter(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--adapter", help="adapter: hub id or folder")
     parser.add_argument("--adapter-scale", type=float, help="0 is the base, 1 the adapter")
-    parser.add_argument("--kind", choices=["depth", "inverse_depth"], help="of a model without a recipe")
+    parser.add_argument("--kind", choices=["depth", "inverse_depth"], help="what is predicted, if no recipe says it")
 
 
 def _demo(args: argparse.Namespace, rest: list[str]) -> int:
@@ -143,8 +185,37 @@ def _train(args: argparse.Namespace, rest: list[str]) -> int:
 
 
 def _evaluate(args: argparse.Namespace, rest: list[str]) -> int:
-    from gift_peft.evaluation.evaluate import run_evaluation
+    if (args.dataset is None) == (args.booster is None):
+        args.usage_error("one of --dataset and --booster is required")
+    if (args.base is None) == (args.predictions is None):
+        args.usage_error("one of --base and --predictions is required")
+    if args.predictions and (args.dataset or args.adapter):
+        args.usage_error("--predictions go with --booster, and without --adapter")
+    from gift_peft.evaluation.evaluate import run_booster, run_evaluation
 
+    common = {
+        "out": args.out,
+        "adapter_scale": args.adapter_scale,
+        "size": args.size,
+        "kind": args.kind,
+        "revision": args.revision,
+        "prediction_scale": args.prediction_scale,
+        "color": sys.stdout.isatty() and "NO_COLOR" not in os.environ,
+    }
+    if args.booster:
+        run_booster(
+            args.booster,
+            args.base,
+            args.adapter,
+            predictions=args.predictions,
+            protocol=args.protocol or "gift",
+            resize=args.resize,
+            occlusion=args.occlusion,
+            subset=args.subset,
+            official=False if args.partial else None,
+            **common,
+        )
+        return 0
     run_evaluation(
         args.base,
         args.dataset,
@@ -152,13 +223,8 @@ def _evaluate(args: argparse.Namespace, rest: list[str]) -> int:
         reference=args.reference,
         protocol=args.protocol,
         split=args.split,
-        out=args.out,
-        adapter_scale=args.adapter_scale,
-        size=args.size,
-        kind=args.kind,
-        revision=args.revision,
         dataset_revision=args.dataset_revision,
-        color=sys.stdout.isatty() and "NO_COLOR" not in os.environ,
+        **common,
     )
     return 0
 
@@ -177,6 +243,21 @@ def _predict(args: argparse.Namespace, rest: list[str]) -> int:
         revision=args.revision,
     )
     print(f"Depth maps written to {args.out}: {len(files)}")
+    return 0
+
+
+def _report(args: argparse.Namespace, rest: list[str]) -> int:
+    from gift_peft.evaluation.report import run_report
+
+    run_report(
+        args.runs,
+        args.out,
+        card=args.model_card or False,
+        zero_shot=args.zero_shot,
+        steps=args.steps,
+        panels=args.panels,
+        color=sys.stdout.isatty() and "NO_COLOR" not in os.environ,
+    )
     return 0
 
 

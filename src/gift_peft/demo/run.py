@@ -12,10 +12,12 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 from gift_peft.data.gift_i import load_gift_i
-from gift_peft.evaluation.evaluate import evaluate_gift_i, make_panel
+from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.figures import before_after
+from gift_peft.evaluation.panels import group_panels
 from gift_peft.evaluation.predict import load_model
-from gift_peft.evaluation.report import before_after, markdown_table, text_table
 from gift_peft.evaluation.results import GiftIReport, write_text
+from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.training import parse_arguments, train
 
 SIZE = "112x140"
@@ -107,16 +109,13 @@ def _panels(groups, report: GiftIReport, loaded) -> list:
         own = _scored(report, kind)
         worst = max(own, key=lambda row: row["base"]["tom"]["rmse"])
         index, names = rows[worst["group_id"]]
-        panels.append(
-            make_panel(
-                groups[index],
-                names["image_names"].index(worst["image"]),
-                loaded.model,
-                label=label,
-                processor=loaded.processor,
-                size=loaded.size,
-                kind=loaded.kind,
-            )
+        panels += group_panels(
+            groups[index],
+            {names["image_names"].index(worst["image"]): label},
+            loaded.model,
+            processor=loaded.processor,
+            size=loaded.size,
+            kind=loaded.kind,
         )
     return panels
 

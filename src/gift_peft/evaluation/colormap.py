@@ -1,6 +1,6 @@
-"""Depth as colour: viridis, perceptually uniform and readable by colour-blind people, from OpenCV's own table.
+"""Depth as viridis, errors as magma: uniform to the eye and readable by colour-blind people; OpenCV's own tables.
 
-Near is bright in every picture, whether the values are depth or inverse depth.
+Near is bright in every picture of depth, of inverse depth too; wrong is bright in an error map.
 """
 
 import cv2
@@ -15,10 +15,18 @@ def colorize(values: np.ndarray, low: float, high: float, kind: str) -> np.ndarr
     Args:
         kind (`str`): `depth` (small is near) or `inverse_depth` (large is near).
     """
-    finite = np.isfinite(values)
-    share = (np.where(finite, values, low) - low) / (high - low if high > low else 1)
-    share = np.clip(share if kind == "inverse_depth" else 1 - share, 0, 1)
-    picture = cv2.applyColorMap(np.rint(share * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
+    share = (np.where(np.isfinite(values), values, low) - low) / (high - low if high > low else 1)
+    return _paint(share if kind == "inverse_depth" else 1 - share, np.isfinite(values), cv2.COLORMAP_VIRIDIS)
+
+
+def colorize_error(values: np.ndarray, high: float) -> np.ndarray:
+    """(H,W) absolute errors to (H,W,3) uint8 RGB; 0..`high` spans the map, what is not finite becomes grey."""
+    share = np.where(np.isfinite(values), values, 0) / (high if high > 0 else 1)
+    return _paint(share, np.isfinite(values), cv2.COLORMAP_MAGMA)
+
+
+def _paint(share: np.ndarray, finite: np.ndarray, table: int) -> np.ndarray:
+    picture = cv2.applyColorMap(np.rint(np.clip(share, 0, 1) * 255).astype(np.uint8), table)[..., ::-1].copy()
     picture[~finite] = GREY
     return picture
 

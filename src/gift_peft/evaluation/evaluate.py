@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from gift_peft.data.gift_i import load_gift_i
 from gift_peft.data.preprocess import Group, collate_group
+from gift_peft.evaluation.booster import evaluate_booster
 from gift_peft.evaluation.predict import load_model, prediction_kind
 from gift_peft.evaluation.predictors import (
     evaluating,
@@ -24,8 +25,8 @@ from gift_peft.evaluation.predictors import (
     to_millimetres,
 )
 from gift_peft.evaluation.protocols import Protocol, get_protocol
-from gift_peft.evaluation.report import Panel, markdown_table, text_table
 from gift_peft.evaluation.results import (
+    BoosterReport,
     GiftIReport,
     by_surface,
     count_rows,
@@ -34,7 +35,8 @@ from gift_peft.evaluation.results import (
     summarize_gce,
     write_text,
 )
-from gift_peft.evaluation.scoring import NO_DEPTH, Task, evaluate_group, references, resize_prediction
+from gift_peft.evaluation.scoring import NO_DEPTH, Task, evaluate_group
+from gift_peft.evaluation.tables import markdown_table, text_table
 
 REFERENCES = {"proxy": "native", "depth": "gift"}  # and the protocol that goes with each
 
@@ -107,7 +109,7 @@ def evaluate_gift_i(
     task = Task(predictors, frozen, models, rules, reference, kind, prediction_scale or to_millimetres(model, rules))
 
     rank, world = (accelerator.process_index, accelerator.num_processes) if accelerator else (0, 1)
-    prepare = _collator(dataset, model, processor, size)
+    prepare = group_collator(dataset, model, processor, size)
     results = []
     with evaluating(model, teacher):
         for index in tqdm(
@@ -145,6 +147,7 @@ def run_evaluation(
     kind: str | None = None,
     revision: str | None = None,
     dataset_revision: str | None = None,
+    prediction_scale: float | None = None,
     batch_size: int = 2,
     device: str | None = None,
     color: bool = False,
@@ -161,6 +164,7 @@ def run_evaluation(
         processor=loaded.processor,
         size=loaded.size,
         kind=kind or loaded.kind,
+        prediction_scale=prediction_scale,
         batch_size=batch_size,
         progress=progress,
     )
@@ -173,47 +177,55 @@ def run_evaluation(
         "split": split,
         "size": list(loaded.size),
     }
+    write_report(report, out, color)
+    return report
+
+
+def run_booster(
+    root: str | Path,
+    base: str | Path | None = None,
+    adapter: str | Path | None = None,
+    *,
+    predictions: str | Path | None = None,
+    out: str | Path = "evaluation",
+    adapter_scale: float | None = None,
+    size: str | tuple[int, int] | None = None,
+    kind: str | None = None,
+    revision: str | None = None,
+    device: str | None = None,
+    color: bool = False,
+    **options: Any,
+) -> BoosterReport:
+    """`gift-peft evaluate --booster`: as `run_evaluation`, of a base or of stored predictions.
+
+    `options` are those of `evaluate_booster`.
+    """
+    if predictions is not None:
+        report = evaluate_booster(root, predictions=predictions, kind=kind, **options)
+    else:
+        loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
+        options |= {"processor": loaded.processor, "size": loaded.size, "kind": kind or loaded.kind}
+        report = evaluate_booster(root, loaded.model, **options)
+        report.about |= {
+            "base": str(base),
+            "revision": revision,
+            "adapter": adapter and str(adapter),
+            "adapter_scale": adapter_scale,
+            "size": list(loaded.size),
+        }
+    write_report(report, out, color)
+    return report
+
+
+def write_report(report: GiftIReport | BoosterReport, out: str | Path, color: bool = False) -> None:
+    """Leaves the report in a folder and prints its table."""
     folder = report.save(out)
     write_text(folder / "report.md", markdown_table(report))
     print(text_table(report, color=color))
     print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
-    return report
 
 
-def make_panel(
-    row: dict,
-    index: int,
-    model: Any,
-    teacher: Any = None,
-    *,
-    label: str,
-    processor: Any = None,
-    size: tuple[int, int] | None = None,
-    kind: str | None = None,
-    reference: str = "depth",
-    batch_size: int = 2,
-) -> Panel:
-    """One observation of a group as a row of `before_after`; arguments as in `evaluate_gift_i`.
-
-    Raises:
-        ValueError: the group has no such reference.
-    """
-    kind = kind or prediction_kind(model)
-    predictors, frozen = make_predictors(model, teacher, True, batch_size)
-    task = Task(predictors, frozen, [], get_protocol(REFERENCES[reference]), reference, kind)
-    group = _collator([row], model, processor, size)(row)
-    with evaluating(model, teacher):
-        targets, masks, _ = references(row, group, task)
-        if targets[index] is None:
-            raise ValueError(f"group {group.group_id} has no {reference} to compare with")
-        shape = targets[index].shape
-        base, adapted = (
-            resize_prediction(predictors[name](group.pixel_values)[index], shape) for name in ("base", "adapted")
-        )
-    return Panel(label, row["images"][index], targets[index], base, adapted, masks[index], kind, task.protocol.name)
-
-
-def _collator(dataset, model, processor, size) -> Callable[[dict], Group]:
+def group_collator(dataset: Any, model: Any, processor: Any, size: Any) -> Callable[[dict], Group]:
     """Rows to groups, at the size of the stored proxies where there are any."""
     first = dataset[0] if len(dataset) else None
     if first is None or isinstance(first, Group):

@@ -151,7 +151,7 @@ def predict_images(
         FileNotFoundError: a picture, base or adapter that is not there. ValueError: an unreadable picture, a
             non-finite prediction, an adapter for another base.
     """
-    files = _list_images(images)
+    files = list_images(images)
     names = _unique_names(files, beside=adapter is not None)
     loaded = load_model(base, adapter, adapter_scale, revision, size, device)
     kind = kind or loaded.kind
@@ -181,7 +181,8 @@ def _at_image_size(depth: torch.Tensor, image: Image.Image, file: Path) -> np.nd
     return torch.nn.functional.interpolate(depth[None], size=size, mode="bicubic", align_corners=False)[0, 0].numpy()
 
 
-def _list_images(images: Sequence[str | Path]) -> list[Path]:
+def list_images(images: Sequence[str | Path]) -> list[Path]:
+    """Picture files, and those of the folders named; FileNotFoundError or ValueError where there are none."""
     files: list[Path] = []
     for path in map(Path, images):
         files += _pictures_in(path) if path.is_dir() else [path]

@@ -1,284 +1,378 @@
-"""The tables and the picture: base, adapted, relative change with its sign, and the consensus that training pulls to.
+"""`gift-peft report RUN...`: the paper's tables and figures of one's own runs, and the adapter's model card.
 
-Laid out like the paper's Tables 1 and 2, one block per region; below stand GCE, the collapse check, the protocol and
-the number of skipped images, without which the numbers above say little (`gift_peft.evaluation.protocols`).
+Reads what training and evaluation left behind. Pictures need base, adapter and data again; where one of them is gone,
+or matplotlib is not installed, the report says so and has the rest.
 """
 
 import math
-import textwrap
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
-import cv2
-import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from tqdm import tqdm
 
-from gift_peft.evaluation.alignment import align, known
-from gift_peft.evaluation.colormap import color_range, colorize
-from gift_peft.evaluation.metrics import METRICS, depth_metrics
-from gift_peft.evaluation.protocols import get_protocol
-from gift_peft.evaluation.results import COLLAPSE_RANGE, REGIONS, GiftIReport
+from gift_peft.evaluation.ablation import ablation_table, is_ablation
+from gift_peft.evaluation.cards import model_card
+from gift_peft.evaluation.compare import write_compare
+from gift_peft.evaluation.curves import draw_dynamics, draw_retention
+from gift_peft.evaluation.figures import Panel, before_after, error_maps
+from gift_peft.evaluation.layout import Table, to_csv, to_latex, to_markdown, to_text
+from gift_peft.evaluation.results import BoosterReport, write_text
+from gift_peft.evaluation.runs import SavedRun, read_run, run_names
+from gift_peft.evaluation.statistics import value_of
+from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table, protocol_note, uncertainty_table
+from gift_peft.evaluation.zero_shot import draw_zero_shot
 
-REGION_NAMES = {"tom": "ToM", "other": "Other", "all": "All"}
-HIGHER_IS_BETTER = {"delta1"}
-GREEN, RED, BOLD, RESET = "\x1b[32m", "\x1b[31m", "\x1b[1m", "\x1b[0m"
-NO_TEACHING = (
-    "The consensus (group median of the base inside the target) is no better than the base itself: "
-    "these groups cannot teach accuracy."
-)
-
-
-def relative_change(base: float | None, adapted: float | None) -> float:
-    """(adapted - base) / |base| in percent; NaN where either is missing or the base is 0."""
-    if base is None or adapted is None or not math.isfinite(base) or not math.isfinite(adapted) or base == 0:
-        return math.nan
-    return 100 * (adapted - base) / abs(base)
-
-
-def improved(metric: str, change: float) -> bool:
-    """Whether a change of this metric is for the better."""
-    return change > 0 if metric in HIGHER_IS_BETTER else change < 0
-
-
-def consensus_teaches(report: GiftIReport) -> bool | None:
-    """Whether the consensus beats the base inside the target, by RMSE; None where that is not known.
-
-    It is not where no group has two observations of a target pixel: the median of one is that one.
-    """
-    if not report.consensus or not report.base or not report.gce["num_groups"]:
-        return None
-    base, consensus = report.base["tom"]["rmse"], report.consensus["tom"]["rmse"]
-    if base is None or consensus is None or math.isnan(base) or math.isnan(consensus):
-        return None
-    return consensus < base
+COMPARED_GROUPS = 40  # compare.html has one observation of that many groups at most: it has to open in a browser
 
 
 @dataclass
-class Panel:
-    """One row of `before_after`: a picture, its reference and two predictions, all arrays (H,W) of one size.
+class Output:
+    """What a report writes, in the order of report.md."""
+
+    folder: Path
+    color: bool
+    sections: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+    def table(self, name: str, table: Table, show: bool = False) -> None:
+        """A table as Markdown, LaTeX, CSV and text; `show` prints it as well."""
+        folder = self.folder / "tables"
+        folder.mkdir(exist_ok=True)
+        for suffix, write in (("txt", to_text), ("md", to_markdown), ("tex", to_latex), ("csv", to_csv)):
+            write_text(folder / f"{name}.{suffix}", write(table))
+        self.sections.append(to_markdown(table))
+        if show:
+            print(to_text(table, self.color))
+
+    def figure(self, name: str, title: str, draw: Callable[..., object]) -> None:
+        """A figure as PNG and, with matplotlib, as PDF."""
+        draw(path=self.folder / f"{name}.png")
+        self.sections.append(f"![{title}]({name}.png)\n")
+        try:
+            draw(path=self.folder / f"{name}.pdf")
+        except ImportError as error:
+            self.remark(f"{name}.pdf: {error}")
+
+    def remark(self, text: str) -> None:
+        """Something that is not in the report, and why."""
+        if text not in self.remarks:
+            self.remarks.append(text)
+
+
+def run_report(
+    runs: Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    card: str | Path | bool = False,
+    zero_shot: Sequence[str | Path] = (),
+    steps: Sequence[int] = (),
+    panels: int = 3,
+    device: str | None = None,
+    color: bool = False,
+) -> Path:
+    """`gift-peft report`: writes tables, figures, compare.html and report.md; returns their folder.
+
+    A run that has no saved evaluation is evaluated first (into `RUN/evaluation`).
 
     Args:
-        label (`str`): what stands above the row.
-        image (`PIL.Image.Image`): the RGB picture, any size of the same shape.
-        reference (`np.ndarray`): mm under `gift`; 0, negative or NaN where unknown (drawn grey).
-        base, adapted (`np.ndarray`): predictions in native units.
-        target (`np.ndarray`): bool, outlined in every picture.
-        kind (`str`): what the predictions are, `depth` or `inverse_depth`.
-        protocol (`str`): how they are aligned to the reference.
-    """
-
-    label: str
-    image: Image.Image
-    reference: np.ndarray
-    base: np.ndarray
-    adapted: np.ndarray
-    target: np.ndarray
-    kind: str
-    protocol: str = "gift"
-
-
-def text_table(report: GiftIReport, color: bool = False) -> str:
-    """The report as aligned plain text of at most 80 columns; improvements carry a `*` (and green if `color`)."""
-    lines = [_paint(_title(report), BOLD, color), ""]
-    lines.append(_text_line("", ["MAE", "AbsRel", "RMSE", "delta1 %"], color, 18))
-    for region in REGIONS:
-        for index, (label, cells) in enumerate(_block(report, region)):
-            name = REGION_NAMES[region] if index == 0 else ""
-            lines.append(_text_line(f"{name:6}{label}", cells, color, 18))
-        lines.append("")
-    lines.append(_text_line("", ["base", "adapted", "change", "consensus"], color, 26))
-    lines += [_text_line(label, cells, color, 26) for label, cells in _pairs(report)]
-    notes = [line for note in _notes(report) for line in textwrap.wrap(note, 80)]
-    return "\n".join([*lines, "", *notes]) + "\n"
-
-
-def markdown_table(report: GiftIReport) -> str:
-    """The report as Markdown; improvements are bold."""
-    lines = [f"**{_title(report)}**", ""]
-    lines += ["| region | | MAE ↓ | AbsRel ↓ | RMSE ↓ | δ1 (%) ↑ |", "|---|---|---:|---:|---:|---:|"]
-    for region in REGIONS:
-        for index, (label, cells) in enumerate(_block(report, region)):
-            name = REGION_NAMES[region] if index == 0 else ""
-            lines.append(f"| {name} | {label} | " + " | ".join(_markdown_cell(cell) for cell in cells) + " |")
-    lines += ["", "| | base | adapted | change | consensus |", "|---|---:|---:|---:|---:|"]
-    lines += [f"| {label} ↓ | " + " | ".join(map(_markdown_cell, cells)) + " |" for label, cells in _pairs(report)]
-    return "\n".join([*lines, "", *(f"{note}  " for note in _notes(report))]) + "\n"
-
-
-def number(value: float | None) -> str:
-    """Five significant digits without an exponent, `-` for what is missing."""
-    if value is None or math.isnan(value):
-        return "-"
-    if math.isinf(value):
-        return "inf"
-    digits = 0 if value == 0 else math.floor(math.log10(abs(value)))
-    return f"{value:.{min(max(4 - digits, 0), 6)}f}"
-
-
-def _title(report: GiftIReport) -> str:
-    against = "the treated-reference proxy" if report.reference == "proxy" else "true depth"
-    counts = report.counts
-    split = report.about.get("split")
-    return (
-        f"GIFT-I{f' {split}' if split else ''} against {against}: "
-        f"{_count(counts['groups'], 'group')}, {_count(counts['images'], 'image')} ({report.unit})"
-    )
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-def _block(report: GiftIReport, region: str) -> list[tuple[str, list]]:
-    """The lines of one region: (label, cells); a cell is a number or, for changes, (percent, improved)."""
-    lines = []
-    if report.base:
-        lines.append(("base", [report.base[region][metric] for metric in METRICS]))
-    if report.adapted:
-        lines.append(("adapted", [report.summary[region][metric] for metric in METRICS]))
-    if report.base and report.adapted:
-        lines.append(("change", [_change(metric, report.base[region], report.summary[region]) for metric in METRICS]))
-    if report.consensus and region == "tom":
-        lines.append(("consensus", [report.consensus[region][metric] for metric in METRICS]))
-    return lines
-
-
-def _change(metric: str, base: dict, adapted: dict) -> tuple[float, bool]:
-    change = relative_change(base[metric], adapted[metric])
-    return change, improved(metric, change)
-
-
-def _pairs(report: GiftIReport) -> list[tuple[str, list]]:
-    """(label, [base, adapted, change, consensus]) of what has one number per model."""
-    pairs = []
-    for label, suffix in (("GCE", ""), ("GCE normalised", "_normalized")):
-        base, adapted = report.gce[f"base{suffix}"], report.gce[f"adapted{suffix}"]
-        change = relative_change(base, adapted)
-        pairs.append((label, [base, adapted, (change, change < 0), None]))
-    for surface, entry in report.by_surface.items():
-        models = (entry["base"], entry["summary"] if report.adapted else None, entry["consensus"])
-        base, adapted, consensus = (model and model["tom"]["rmse"] for model in models)
-        change = relative_change(base, adapted)
-        pairs.append(
-            (f"ToM RMSE, {surface} ({entry['num_images']})", [base, adapted, (change, change < 0), consensus])
-        )
-    return pairs
-
-
-def _notes(report: GiftIReport) -> list[str]:
-    notes = []
-    if report.collapse:
-        state = "COLLAPSE ALARM" if report.collapse["alarm"] else "no collapse alarm"
-        ratios = [number(report.collapse[name]) for name in ("target_mean_ratio", "spread_ratio")]
-        notes.append(
-            f"Adapted/base: target mean x{ratios[0]}, spread x{ratios[1]}: {state} "
-            f"(outside {COLLAPSE_RANGE[0]:g}..{COLLAPSE_RANGE[1]:g})."
-        )
-    if consensus_teaches(report) is False:
-        notes.append(NO_TEACHING)
-    counts, gce = report.counts, report.gce
-    reasons = ", ".join(f"{n} {reason}" for reason, n in counts["reasons"].items())
-    other = f", {counts['without_other']} with nothing else" if counts["without_other"] else ""
-    notes.append(f"Protocol {report.protocol['description']}.")
-    notes.append(
-        f"Skipped: {counts['skipped']} of {_count(counts['images'], 'image')}{f' ({reasons})' if reasons else ''}; "
-        f"{counts['without_tom']} without known target pixels{other}; GCE over {_count(gce['num_groups'], 'group')}, "
-        f"{gce['num_skipped']} without a pair."
-    )
-    return notes
-
-
-def _text_line(label: str, cells: list, color: bool, indent: int) -> str:
-    return (f"{label:{indent}}" + "".join(_text_cell(cell, color) for cell in cells)).rstrip()
-
-
-def _text_cell(cell, color: bool) -> str:
-    """13 columns, the last of them for the mark of an improvement."""
-    if isinstance(cell, str):
-        return f"{cell:>12} "
-    if not isinstance(cell, tuple) or math.isnan(cell[0]):
-        return f"{'-' if isinstance(cell, tuple) else number(cell):>12} "
-    change, better = cell
-    text = f"{change:+.1f} %"
-    padding = " " * (12 - len(text))
-    return padding + _paint(text, GREEN if better else RED, color and change != 0) + ("*" if better else " ")
-
-
-def _markdown_cell(cell) -> str:
-    if not isinstance(cell, tuple):
-        return number(cell)
-    change, better = cell
-    if math.isnan(change):
-        return "-"
-    return f"**{change:+.1f} %**" if better else f"{change:+.1f} %"
-
-
-def _paint(text: str, code: str, color: bool) -> str:
-    return f"{code}{text}{RESET}" if color else text
-
-
-# ---- the picture ----
-
-TILE_WIDTH, GAP, HEADER, CAPTION = 360, 8, 34, 30
-
-
-def before_after(
-    rows: Sequence[Panel], path: str | Path, columns: Sequence[str] = ("RGB", "true depth", "base", "GIFT")
-) -> Path:
-    """Draws one row per panel: picture, reference, base, adapted, aligned and in one colour range; near is bright.
-
-    The caption gives the RMSE inside the target before and after, and the range of the colours.
+        runs: folders of runs or evaluations; with `card` alone also the YAML file of a run that was not made yet.
+        out (*optional*): default `report` inside the only run, else beside the working directory's files.
+        card: also write the model card of the (only) run: True for `out`/model_card.md, or a file.
+        zero_shot: pictures for the panel of base and checkpoints, or folders of them.
+        steps: the checkpoints of that panel; default those the run was told to keep (`checkpoint_at_steps`), else all.
+        panels: rows of the before/after figure; 0 draws no pictures and loads no model.
+        device (*optional*): for the models.
+        color: of the tables printed.
 
     Raises:
-        ValueError: no rows, or a panel whose arrays differ in size.
+        FileNotFoundError: a folder that is neither run nor evaluation; a picture or checkpoint that is not there.
+        ValueError: a damaged file; a card of several runs.
     """
-    if not rows:
-        raise ValueError("before_after needs at least one panel")
-    strips = [_draw_row(panel) for panel in rows]
-    width = strips[0].width
-    canvas = Image.new("RGB", (width, HEADER + sum(strip.height for strip in strips)), "white")
-    draw = ImageDraw.Draw(canvas)
-    for index, title in enumerate(columns):
-        center = GAP + index * (TILE_WIDTH + GAP) + TILE_WIDTH // 2
-        draw.text((center, HEADER // 2), title, fill="black", font=ImageFont.load_default(size=22), anchor="mm")
-    top = HEADER
-    for strip in strips:
-        canvas.paste(strip, (0, top))
-        top += strip.height
-    canvas.save(path)
-    return Path(path)
+    if not runs:
+        raise ValueError("report needs a run")
+    saved = [read_run(path) for path in runs]
+    if card and len(saved) > 1:
+        raise ValueError("--model-card is of one run: name one")
+    planned = [run for run in saved if run.path.is_file()]
+    if planned and not card:
+        raise ValueError(f"{planned[0].path}: not a run yet; --model-card FILE writes the card of what it will be")
+    if planned:
+        return _write_card(saved[0], Path("model_card.md") if card is True else Path(card))
+    folder = Path(out) if out else saved[0].path / "report" if len(saved) == 1 else Path("report")
+    folder.mkdir(parents=True, exist_ok=True)
+    output = Output(folder, color)
+    names = run_names(saved)
+    for run in saved:
+        _evaluate_if_missing(run, output, device)
+    _tables(saved, names, output)
+    _curves(saved, names, output)
+    if panels:
+        for run, name in zip(saved, names, strict=True):
+            _pictures(
+                run, name, output, panels, device, suffix=f"-{run.path.resolve().name}" if len(saved) > 1 else ""
+            )
+    if zero_shot:
+        for run in saved:
+            _zero_shot(run, zero_shot, steps, output, device)
+    if card:
+        path = _write_card(saved[0], folder / "model_card.md" if card is True else Path(card))
+        output.sections.append(f"Model card: [{path.name}]({path.name if path.parent == folder else path})\n")
+    _write_markdown(names, output)
+    print(f"Report: {folder}/report.md")
+    for remark in output.remarks:
+        print(f"  not in it: {remark}")
+    return folder
 
 
-def _draw_row(panel: Panel) -> Image.Image:
-    everywhere = np.ones(panel.reference.shape, bool)
-    aligned = [
-        align(prediction, panel.reference, everywhere, panel.protocol, panel.kind).aligned
-        for prediction in (panel.base, panel.adapted)
-    ]
-    reference = np.where(known(panel.reference), panel.reference, np.nan)
-    low, high = color_range(reference, *aligned)
-    in_depth = get_protocol(panel.protocol).space != "native"
-    maps = [colorize(depth, low, high, "depth" if in_depth else panel.kind) for depth in (reference, *aligned)]
-    height = round(TILE_WIDTH * panel.reference.shape[0] / panel.reference.shape[1])
-    strip = Image.new("RGB", (GAP + 4 * (TILE_WIDTH + GAP), CAPTION + height + GAP), "white")
-    errors = [depth_metrics(depth, panel.reference, panel.target)["rmse"] for depth in aligned]
-    before, after, near, far = (f"{v:.0f} mm" if in_depth else f"{v:.3g}" for v in (*errors, low, high))
-    scores = "unknown" if np.isnan(errors).any() else f"{before} before, {after} after"
-    caption = f"{panel.label}   RMSE in the outline: {scores}   (colours {near} to {far})"
-    font = ImageFont.load_default(size=17)
-    ImageDraw.Draw(strip).text((GAP, CAPTION // 2), caption, fill="black", font=font, anchor="lm")
-    for index, picture in enumerate((panel.image, *map(Image.fromarray, maps))):
-        tile = np.asarray(picture.convert("RGB").resize((TILE_WIDTH, height), Image.Resampling.BICUBIC))
-        strip.paste(Image.fromarray(_outline(tile, panel.target)), (GAP + index * (TILE_WIDTH + GAP), CAPTION))
-    return strip
+def _write_card(run: SavedRun, path: Path) -> Path:
+    reports = [report for report in run.evaluations.values() if report.adapted]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, model_card(run.arguments, run.record, reports))
+    print(f"Model card: {path}")
+    return path
 
 
-def _outline(tile: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """A white line inside the target's border and a black one outside: visible on any colour."""
-    mask = cv2.resize(target.astype(np.uint8), tile.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-    kernel = np.ones((3, 3), np.uint8)
-    tile = tile.copy()
-    tile[cv2.dilate(mask, kernel) > mask] = 0
-    tile[mask > cv2.erode(mask, kernel)] = 255
-    return tile
+def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> None:
+    if run.evaluations or run.adapter is None:
+        return
+    from gift_peft.evaluation.evaluate import run_evaluation
+
+    arguments = run.arguments
+    try:
+        report = run_evaluation(
+            arguments["model_name_or_path"],
+            arguments["dataset_name"],
+            run.adapter,
+            revision=arguments.get("model_revision"),
+            out=run.path / "evaluation",
+            device=device,
+        )
+    except (OSError, ValueError, KeyError) as error:
+        output.remark(f"tables of {run.path}, which has no evaluation and could not be evaluated: {_line(error)}")
+        return
+    run.evaluations["evaluation"] = report
+
+
+# ---- tables ----
+
+
+def _tables(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> None:
+    """One comparison per dataset and protocol, with intervals and groups of every report behind it."""
+    together: dict[tuple, list[tuple[str, SavedRun, AnyReport]]] = {}
+    for run, name in zip(runs, names, strict=True):
+        for report in run.evaluations.values():
+            key = (_dataset(report), report.unit, protocol_note(report))
+            together.setdefault(key, []).append((_scaled(name, report), run, report))
+    used: dict[str, int] = {}
+    for (dataset, *_), entries in together.items():
+        used[dataset] = used.get(dataset, 0) + 1
+        stem = dataset if used[dataset] == 1 else f"{dataset}-{used[dataset]}"
+        output.sections.append(f"## {HEADINGS[dataset]}\n")
+        output.table(stem, comparison_table([(name, report) for name, _, report in entries]), show=True)
+        for name, run, report in entries:
+            own = f"{stem}-{run.path.resolve().name}" if len(entries) > 1 else stem
+            if len(entries) > 1:
+                output.sections.append(f"### {name}\n")
+            output.table(f"{own}-intervals", uncertainty_table(report))
+            output.table(f"{own}-groups", group_table(report))
+    if is_ablation(runs):
+        output.sections.append("## Loss weights\n")
+        output.table("loss-weights", ablation_table(runs), show=True)
+
+
+HEADINGS = {
+    "gift-i-proxy": "GIFT-I, against the treated reference",
+    "gift-i-depth": "GIFT-I, against true depth",
+    "booster": "Booster",
+}
+
+
+def _dataset(report: AnyReport) -> str:
+    return "booster" if isinstance(report, BoosterReport) else f"gift-i-{report.reference}"
+
+
+def _scaled(name: str, report: AnyReport) -> str:
+    scale = report.about.get("adapter_scale")
+    return name if scale in (None, 1) else f"{name} (adapter scale {scale:g})"
+
+
+# ---- curves ----
+
+
+def _curves(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> None:
+    histories = [(name, run.history) for run, name in zip(runs, names, strict=True) if len(run.history) > 1]
+    if not histories:
+        return
+    for name, title, draw in (
+        ("dynamics", "GCE and ToM error in training, relative to the base", draw_dynamics),
+        ("retention", "Error outside the target in training, relative to the base", draw_retention),
+    ):
+        try:
+            drawn = draw(histories, [output.folder / f"{name}.png", output.folder / f"{name}.pdf"])
+        except (ImportError, ValueError) as error:
+            output.remark(f"{name}.png: {_line(error)}")
+            continue
+        if drawn:
+            output.sections.append(f"## {title}\n\n![{title}]({name}.png)\n")
+
+
+# ---- pictures ----
+
+
+def _pictures(run: SavedRun, name: str, output: Output, count: int, device: str | None, suffix: str) -> None:
+    """Before and after, error maps and compare.html of a run: true depth before proxies, and Booster."""
+    reports = {_dataset(r): r for r in run.evaluations.values() if r.adapted and r.base and r.about.get("adapter")}
+    if "gift-i-depth" in reports:
+        reports.pop("gift-i-proxy", None)
+    for dataset, report in reports.items():
+        stem = f"{'-booster' if dataset == 'booster' else ''}{suffix}"
+        reference = {"gift-i-proxy": "proxy", "gift-i-depth": "true depth", "booster": "measured depth"}[dataset]
+        notable = notable_observations(report, count)
+        kept: dict[tuple[str, str], Panel] = {}
+        title = f"{name}: before and after, {HEADINGS[dataset]}"
+        try:
+            stream = _panels(run, report, notable, kept, device)
+            write_compare(
+                stream,
+                output.folder / f"compare{stem}.html",
+                title=title,
+                notes=[protocol_note(report), "Per group the observation on which the base errs most, and extremes."],
+                columns=("RGB", reference, "base", "GIFT"),
+            )
+        except (OSError, ValueError) as error:
+            output.remark(f"pictures of {run.path}: {_line(error)}")
+            continue
+        rows = [kept[key] for key in notable]
+        output.sections.append(f"## {title}\n\n[Sliders](compare{stem}.html)\n")
+        columns = ("RGB", reference, "base", "GIFT")
+        output.figure(f"before-after{stem}", title, partial(before_after, rows, columns=columns))
+        output.figure(f"errors{stem}", f"{title}: errors", partial(error_maps, rows))
+
+
+def notable_observations(report: AnyReport, count: int) -> dict[tuple[str, str], str]:
+    """{(group, image): why}: in turn where the base errs most in the target, where it got better, and where worse.
+
+    Each of another group, chosen by these rules alone, so that nobody has to trust a choice of pictures.
+    """
+    scored = []
+    for row in report.rows:
+        base, adapted = (value_of(row, model, "tom", "rmse") for model in ("base", "adapted"))
+        if not row["skipped"] and not math.isnan(base) and not math.isnan(adapted):
+            scored.append((row["group_id"], row["image"], base, adapted))
+    rankings = {
+        "largest error of the base": sorted(scored, key=lambda entry: (-entry[2], entry[:2])),
+        "largest improvement": sorted((e for e in scored if e[3] < e[2]), key=lambda e: (e[3] - e[2], e[:2])),
+        "largest deterioration": sorted((e for e in scored if e[3] > e[2]), key=lambda e: (e[2] - e[3], e[:2])),
+    }
+    chosen: dict[tuple[str, str], str] = {}
+    groups: set[str] = set()
+    while len(chosen) < count and any(rankings.values()):
+        for reason, ranking in rankings.items():
+            while ranking and ranking[0][0] in groups:
+                ranking.pop(0)
+            if ranking and len(chosen) < count:
+                group, image, *_ = ranking.pop(0)
+                chosen[group, image] = reason
+                groups.add(group)
+    return chosen
+
+
+def _panels(
+    run: SavedRun, report: AnyReport, notable: dict, kept: dict[tuple[str, str], Panel], device: str | None
+) -> Iterator[Panel]:
+    """Panels group by group, the notable ones also into `kept`; only one group is in memory."""
+    from gift_peft.evaluation.predict import load_model
+
+    about = report.about
+    base = about.get("base") or run.arguments.get("model_name_or_path")
+    loaded = load_model(
+        base, about["adapter"], about.get("adapter_scale"), about.get("revision"), about.get("size"), device
+    )
+    options = {"processor": loaded.processor, "size": loaded.size, "kind": about.get("kind") or loaded.kind}
+    options["protocol"] = report.protocol["name"]
+    wanted = _wanted(report, notable)
+    if not wanted:
+        raise ValueError("no image has a known target to compare")
+    groups = None if isinstance(report, BoosterReport) else _group_rows(report)
+    for group_id, images in tqdm(wanted.items(), desc="pictures", unit="group", disable=None):
+        labels = {image: _label(group_id, image, notable) for image in images}
+        for image, panel in zip(images, _group_panels(report, groups, group_id, labels, loaded, options), strict=True):
+            if (group_id, image) in notable:
+                kept[group_id, image] = panel
+            yield panel
+
+
+def _wanted(report: AnyReport, notable: dict) -> dict[str, list[str]]:
+    """{group: images}: of each group the image on which the base errs most, and the notable ones; largest errors."""
+    worst: dict[str, tuple[float, str]] = {}
+    for row in report.rows:
+        error = value_of(row, "base", "tom", "rmse")
+        if not row["skipped"] and not math.isnan(error) and error > worst.get(row["group_id"], (-1.0, ""))[0]:
+            worst[row["group_id"]] = error, row["image"]
+    largest = set(sorted(worst, key=lambda group: (-worst[group][0], group))[:COMPARED_GROUPS])
+    largest |= {group for group, _ in notable}
+    return {
+        group: list(dict.fromkeys([*(image for own, image in notable if own == group), worst[group][1]]))
+        for group in worst
+        if group in largest
+    }
+
+
+def _label(group_id: str, image: str, notable: dict) -> str:
+    reason = notable.get((group_id, image))
+    return f"{group_id}/{image}" + (f", {reason}" if reason else "")
+
+
+def _group_rows(report: AnyReport) -> Callable[[str], dict]:
+    """From a group's id to its row of the dataset."""
+    from gift_peft.data.gift_i import load_gift_i
+
+    about = report.about
+    rows = load_gift_i(
+        about["dataset"], about.get("split") or "validation", dataset_revision=about.get("dataset_revision")
+    )
+    index = {group_id: number for number, group_id in enumerate(rows.select_columns(["group_id"])["group_id"])}
+
+    def find(group_id: str) -> dict:
+        if group_id not in index:
+            raise ValueError(f"{about['dataset']} no longer has group {group_id}")
+        return rows[index[group_id]]
+
+    return find
+
+
+def _group_panels(report, find, group_id: str, labels: dict[str, str], loaded, options: dict) -> list[Panel]:
+    from gift_peft.evaluation.panels import group_panels, scene_panels
+
+    if isinstance(report, BoosterReport):
+        return scene_panels(report.about, group_id, labels, loaded.model, **options)
+    row = find(group_id)
+    missing = [image for image in labels if image not in row["image_names"]]
+    if missing:
+        raise ValueError(f"group {group_id} no longer has image {missing[0]}")
+    numbers = {row["image_names"].index(image): label for image, label in labels.items()}
+    return group_panels(row, numbers, loaded.model, reference=report.reference, **options)
+
+
+def _zero_shot(
+    run: SavedRun, images: Sequence[str | Path], steps: Sequence[int], output: Output, device: str | None
+) -> None:
+    name = f"zero-shot-{run.path.resolve().name}"
+    files = [output.folder / f"{name}.png", output.folder / f"{name}.pdf"]
+    try:
+        draw_zero_shot(run, images, steps, files, device)
+    except ImportError as error:
+        output.remark(f"{name}.pdf: {error}")
+    output.sections.append(f"## Pictures the training never saw\n\n![base and checkpoints]({name}.png)\n")
+
+
+def _write_markdown(names: Sequence[str], output: Output) -> None:
+    head = f"# GIFT: {', '.join(dict.fromkeys(names))}\n"
+    missing = [f"Not in this report: {remark}\n" for remark in output.remarks]
+    write_text(output.folder / "report.md", "\n".join([head, *output.sections, *missing]))
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())

@@ -1,0 +1,121 @@
+"""A run's course from metrics.jsonl: the paper's Figures 5 (everything falls together) and 6 (what Other costs).
+
+Every curve is divided by its value at step 0, the base's, and smoothed by a centred mean over epochs; the unsmoothed
+values stay visible behind it. Colours are Okabe and Ito's, and no two curves share colour and dashes.
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from gift_peft.evaluation.figures import import_pyplot
+
+# Figure 5; of Figure 6 whichever a run has.
+DYNAMICS = {"train_gce": "train GCE", "val_gce": "validation GCE", "booster_tom_rmse": "Booster ToM RMSE"}
+RETENTION = {"val_other_rmse": "GIFT-I Other RMSE", "booster_other_rmse": "Booster Other RMSE"}
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+DASHES = ("-", "--", "-.", ":")
+DIVERGED = 2.0  # times the base: such runs hide the others, so these get a plot of their own
+
+Curve = tuple[str, list[float], list[float]]
+
+
+def normalised(history: Sequence[dict], key: str) -> tuple[list[float], list[float]]:
+    """(epochs, values over the first one) of a column of metrics.jsonl; empty where it was not measured.
+
+    Rows without a value are left out. Raises ValueError if the first value is 0: nothing can be relative to it.
+    """
+    rows = [(row["epoch"], row[key]) for row in history if row.get(key) is not None]
+    if not rows:
+        return [], []
+    first = rows[0][1]
+    if first == 0:
+        raise ValueError(f"{key} is 0 at step {history[0]['step']}: the curve cannot be relative to that")
+    return [float(epoch) for epoch, _ in rows], [value / first for _, value in rows]
+
+
+def smooth(values: Sequence[float], width: int) -> list[float]:
+    """Centred mean over `width` values (odd), narrower towards both ends so that the first value stays itself."""
+    half = width // 2
+    means = []
+    for index in range(len(values)):
+        reach = min(half, index, len(values) - 1 - index)
+        window = values[index - reach : index + reach + 1]
+        means.append(math.fsum(window) / len(window))
+    return means
+
+
+def draw_dynamics(
+    runs: Sequence[tuple[str, list[dict]]], paths: Sequence[Path], width: int | None = None
+) -> list[str]:
+    """Figure 5, a plot per run: train GCE, validation GCE and, if it was logged, Booster ToM RMSE.
+
+    Args:
+        runs: (name, rows of metrics.jsonl).
+        paths: files to write, .png or .pdf.
+        width: values in the smoothing window (odd); default a tenth of the curve, at least 3.
+
+    Returns:
+        `list[str]`: names of the curves drawn; nothing is written if there are none.
+    """
+    plots = [(name, _curves(history, DYNAMICS)) for name, history in runs]
+    return _draw([plot for plot in plots if plot[1]], "relative to the base", paths, width)
+
+
+def draw_retention(
+    runs: Sequence[tuple[str, list[dict]]], paths: Sequence[Path], width: int | None = None
+) -> list[str]:
+    """Figure 6: error outside the target of all runs in one plot, and where some diverge a second one of the rest.
+
+    Arguments and result as in `draw_dynamics`; a plot per dataset.
+    """
+    plots = []
+    for key, title in RETENTION.items():
+        curves = [(name, *normalised(history, key)) for name, history in runs]
+        curves = [curve for curve in curves if curve[1]]
+        calm = [curve for curve in curves if max(curve[2]) <= DIVERGED]
+        if curves:
+            plots.append((title, curves))
+        if 0 < len(calm) < len(curves):
+            plots.append((f"{title}, without diverged runs", calm))
+    return _draw(plots, "relative to the base", paths, width)
+
+
+def _curves(history: list[dict], keys: dict[str, str]) -> list[Curve]:
+    curves = [(title, *normalised(history, key)) for key, title in keys.items()]
+    return [curve for curve in curves if curve[1]]
+
+
+def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Path], width: int | None) -> list[str]:
+    if not plots:
+        return []
+    names = list(dict.fromkeys(name for _, curves in plots for name, _, _ in curves))
+    pyplot = import_pyplot()
+    figure, axes = pyplot.subplots(
+        1, len(plots), figsize=(max(4.8, 3.6 * len(plots)), 3.2), squeeze=False, layout="constrained"
+    )
+    try:
+        for axis, (title, curves) in zip(axes[0], plots, strict=True):
+            for name, epochs, values in curves:
+                number = names.index(name)
+                style = {"color": COLORS[number % len(COLORS)], "linestyle": DASHES[number % len(DASHES)]}
+                axis.plot(epochs, values, color=style["color"], alpha=0.25, linewidth=1)
+                axis.plot(
+                    epochs, smooth(values, width or max(3, len(values) // 10 | 1)), label=name, linewidth=1.8, **style
+                )
+            axis.axhline(1, color="0.5", linewidth=0.8)
+            if max(max(values) for _, _, values in curves) > 10:
+                axis.set_yscale("log")
+            axis.set(title=title, xlabel="epoch", ylabel=ylabel)
+            axis.title.set_fontsize(10)
+            axis.legend(fontsize=8, frameon=False)
+            axis.spines[["top", "right"]].set_visible(False)
+        for path in paths:
+            temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+            metadata = {"CreationDate": None} if path.suffix == ".pdf" else None
+            figure.savefig(temporary, dpi=150, metadata=metadata)
+            os.replace(temporary, path)
+    finally:
+        pyplot.close(figure)
+    return names

@@ -303,10 +303,10 @@ def labelme_at(path):
 
 
 BAD = {
-    "other size": ("masks/1.png", picture(BOX.T), "masks/1.png: the mask is 8x12"),
+    "other size": ("masks/1.png", picture(BOX.T), "masks/1.png: the mask is 12x8"),
     "truncated": ("masks/1.png", "\x89PNG", "masks/1.png: not a readable image"),
     "colours": ("masks/1.png", np.zeros((8, 12, 3), np.uint8), "masks/1.png: mode RGB"),
-    "labelme other size": ("1.json", labelme(imageWidth=13), "1.json: its shapes are for 13x8"),
+    "labelme other size": ("1.json", labelme(imageWidth=13), "1.json: its shapes are for 8x13"),
     "labelme absolute": ("1.json", labelme_at("/home/me/1.jpg"), "1.json: imagePath: '/home/me/1.jpg' is an absolute"),
     "labelme climbs": ("1.json", labelme_at("..\\1.jpg"), "absolute path or climbs"),
     "labelme drive": ("1.json", labelme_at("C:\\1.jpg"), "absolute path or climbs"),
@@ -329,7 +329,7 @@ BAD = {
     "coco image": ("x.json", coco(image_id=9), "x.json: an annotation for image id 9, which is not listed"),
     "coco absolute": ("x.json", coco("/data/1.jpg"), "x.json: '/data/1.jpg' is an absolute path or climbs"),
     "coco climbs": ("x.json", coco("a/../../1.jpg"), "absolute path or climbs"),
-    "label studio size": ("x.json", tasks(region(points=CORNERS) | {"original_width": 9}), "an image of 9x8"),
+    "label studio size": ("x.json", tasks(region(points=CORNERS) | {"original_width": 9}), "an image of 8x9"),
     "label studio no area": ("x.json", tasks(region("keypointlabels", x=1, y=2)), "'keypointlabels' has no area"),
     "label studio no label": ("x.json", tasks(region() | {"value": {"points": CORNERS}}), "without a label"),
     "label studio cut": ("x.json", tasks(region("brushlabels", rle=[0, 0, 1, 128])), "cut short"),

@@ -350,7 +350,7 @@ def relative_name(name) -> str:
 
 def check_size(name: str, size: tuple, expected: tuple[int, int]) -> None:
     if size != (None, None) and tuple(size) != tuple(expected):  # some exports do not state it
-        raise ValueError(f"{name} {size[0]}x{size[1]} (width x height), but the image is {expected[0]}x{expected[1]}")
+        raise ValueError(f"{name} {size[1]}x{size[0]} (height x width), but the image is {expected[1]}x{expected[0]}")
 
 
 def _dicts(items, what: str) -> list[dict]:

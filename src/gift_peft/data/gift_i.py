@@ -73,17 +73,22 @@ class GiftI(datasets.GeneratorBasedBuilder):
             raise ValueError('GIFT-I needs its folder: load_dataset("gift_i", data_dir="path/to/RAW")')
         return [
             datasets.SplitGenerator(
-                name=split, gen_kwargs={"groups": [str(group) for group in groups], "split": split}
+                name=split,
+                gen_kwargs={
+                    "groups": [str(group) for group in groups],
+                    "split": split,
+                    "root": str(self.config.data_dir),
+                },
             )
             for split, groups in list_groups(self.config.data_dir).items()
         ]
 
-    def _generate_shards(self, groups, split):
+    def _generate_shards(self, groups, split, root):
         yield from groups
 
-    def _generate_examples(self, groups, split):
+    def _generate_examples(self, groups, split, root):
         for shard, folder in enumerate(groups):
-            yield Key(shard, 0), raw_example(Path(folder), split)
+            yield Key(shard, 0), raw_example(Path(folder), split, Path(root))
 
 
 def register() -> None:
@@ -93,10 +98,14 @@ def register() -> None:
     """
     from datasets import packaged_modules
 
-    from gift_peft.data import preprocess, raw
+    from gift_peft.data import annotations, masks, preprocess, raw
 
     # The hash names the cache: of everything that decides what a raw tree becomes.
-    lines = [line for module in (sys.modules[__name__], raw, preprocess) for line in _source_lines(module)]
+    lines = [
+        line
+        for module in (sys.modules[__name__], raw, masks, annotations, preprocess)
+        for line in _source_lines(module)
+    ]
     packaged_modules._PACKAGED_DATASETS_MODULES["gift_i"] = (__name__, packaged_modules._hash_python_lines(lines))
 
 

@@ -18,6 +18,7 @@ from PIL import Image
 
 from gift_peft.data.preprocess import SURFACES, check_group, image_digest, label_items, open_image, to_mask, to_rgb
 from gift_peft.data.raw import SPLITS
+from gift_peft.files import write_whole
 
 NAMES = pa.list_(pa.string())
 SCHEMA = pa.schema(
@@ -93,27 +94,49 @@ def write_gift_i(
     folder = Path(folder)
     rows = {split: _read_rows(folder / split / "metadata.parquet") for split in SPLITS}
     for group in groups:
-        split = group.get("split")
-        if split not in SPLITS:
-            raise ValueError(f"group {group.get('group_id')}: split {split!r}; write train or validation")
-        row = _write_group(group, folder / split)
-        rows[split][row["group_id"]] = row
-        _write_metadata(folder / split / "metadata.parquet", rows[split].values())
+        row = write_group(group, folder)
+        rows[group["split"]][row["group_id"]] = row
+        write_rows(rows, folder)
+    write_card(rows, folder, license, pretty_name, description)
+    return folder
+
+
+def write_rows(rows: dict[str, dict[str, dict]], folder: Path) -> None:
+    """The table of each split: `rows[split][group_id]` as `write_group` gives them; no table for an empty split."""
+    for split in SPLITS:
+        path = folder / split / "metadata.parquet"
+        if rows[split]:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _write_metadata(path, rows[split].values())
+        else:
+            path.unlink(missing_ok=True)
+
+
+def write_card(
+    rows: dict[str, dict[str, dict]], folder: Path, license: str, pretty_name: str, description: str
+) -> None:
+    """The readable table and the dataset card; ValueError if there is no group."""
     lines = [json.dumps({"split": split, **row}) + "\n" for split in SPLITS for row in rows[split].values()]
     if not lines:
         raise ValueError(f"no groups to write to {folder}")
-    _replace(folder / "groups.jsonl", "".join(lines).encode())
-    _replace(folder / "README.md", _card(rows, license, pretty_name, description).encode())
-    return folder
+    write_whole(folder / "groups.jsonl", "".join(lines))
+    write_whole(folder / "README.md", _card(rows, license, pretty_name, description))
 
 
 def _read_rows(path: Path) -> dict[str, dict]:
     return {row["group_id"]: row for row in pq.read_table(path).to_pylist()} if path.exists() else {}
 
 
-def _write_group(group: dict, folder: Path) -> dict:
-    """Check a group, write its folder beside the final place and rename it there; its metadata row."""
-    group_id = group["group_id"]
+def write_group(group: dict, root: Path) -> dict:
+    """Check a group, write its folder beside the final place and rename it there; its metadata row.
+
+    `group` as `write_gift_i` takes it, `root` the prepared folder. Until the row is in the table the group is not
+    part of the dataset. Raises ValueError or FileNotFoundError naming the file or group.
+    """
+    group_id, split = group["group_id"], group.get("split")
+    if split not in SPLITS:
+        raise ValueError(f"group {group_id}: split {split!r}; write train or validation")
+    folder = root / split
     check_group_id(group_id)
     surface = group.get("surface")
     if surface is not None and surface not in SURFACES:
@@ -125,8 +148,8 @@ def _write_group(group: dict, folder: Path) -> dict:
     depths = [_depth(*item) for item in label_items(group_id, names, "depth", group.get("depths"), True)]
     reference = group.get("reference")
     reference_image = None if reference is None else _rgb(reference, f"group {group_id}: the reference")
-    check_group(group_id, names, images, masks, valids, depths, reference_image, train=group["split"] == "train")
-    least = 1 if group["split"] == "validation" and reference is not None else 2
+    check_group(group_id, names, images, masks, valids, depths, reference_image, train=split == "train")
+    least = 1 if split == "validation" and reference is not None else 2
     if len({image_digest(image) for image in images}) < max(least, len(images)):
         raise ValueError(f"group {group_id}: {len(images)} images; it takes at least {least}, all different")
 
@@ -206,13 +229,7 @@ def _save(item, stem: Path) -> str:
 def _write_metadata(path: Path, rows: Iterable[dict]) -> None:
     sink = pa.BufferOutputStream()
     pq.write_table(pa.Table.from_pylist(list(rows), schema=SCHEMA), sink)
-    _replace(path, sink.getvalue().to_pybytes())
-
-
-def _replace(path: Path, content: bytes) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
+    write_whole(path, sink.getvalue().to_pybytes())
 
 
 def _card(rows: dict[str, dict], license: str, pretty_name: str, description: str) -> str:

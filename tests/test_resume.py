@@ -293,7 +293,7 @@ def test_leftovers_give_a_replaced_folder_its_name_back(tmp_path):
 def test_leftovers_are_a_runs_own(tmp_path):
     for name in (".env.old", ".cache.tmp", ".metrics.jsonl.bak", ".adapter-mine.tmp"):
         (tmp_path / name).mkdir()
-    for name in (".metrics.jsonl.123", ".config.yaml.9"):
+    for name in (".metrics.jsonl.123.partial", ".config.yaml.9.partial"):
         (tmp_path / name).write_text("half")
     for name in ("..checkpoint-3.tmp.tmp", "..checkpoint-3.tmp.old", ".adapter.tmp", ".adapter-last.old"):
         (tmp_path / name).mkdir()

@@ -20,7 +20,8 @@ import safetensors.numpy
 import safetensors.torch
 
 from gift_peft.data.preprocess import Group, pixel_settings, resize_row, to_group
-from gift_peft.data.proxies import METADATA, row_digests, write_whole
+from gift_peft.data.proxies import METADATA, row_digests
+from gift_peft.files import write_whole
 
 FORMAT = "gift-peft group 1"
 PICTURES = ("images", "masks", "valids")

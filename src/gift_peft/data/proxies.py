@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import safetensors
 
 from gift_peft.data.preprocess import image_digest
+from gift_peft.files import write_whole
 
 if TYPE_CHECKING:
     import torch
@@ -100,24 +101,6 @@ def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: to
         tensors["reference"] = reference.float().contiguous()
     # One entry, because safetensors writes several in random order, and equal proxies shall be equal files.
     write_whole(path, safetensors.torch.save(tensors, metadata={METADATA: json.dumps(header, sort_keys=True)}))
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file, whole or not at all, and remove what killed attempts at it left behind."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial")
-    with open(partial, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    try:
-        os.replace(partial, path)
-    except FileNotFoundError:  # another run wrote the same at the same time and tidied up below
-        if not path.exists():
-            raise
-    for leftover in path.parent.glob(f".{path.stem}.*.partial"):
-        if leftover.name.removeprefix(f".{path.stem}.").removesuffix(".partial").isdigit():  # not of a group "a.b"
-            leftover.unlink(missing_ok=True)
 
 
 def make_header(teacher: str, revision: str, size: tuple[int, int], settings: dict) -> dict:

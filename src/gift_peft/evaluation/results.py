@@ -5,7 +5,6 @@ Summaries are means over images, pixels or groups (NaN left out and counted), wh
 
 import json
 import math
-import os
 from collections import Counter
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gift_peft.evaluation.metrics import METRICS
+from gift_peft.files import write_whole
 
 REGIONS = ("tom", "other", "all")
 COLLAPSE_RANGE = (0.5, 2.0)
@@ -138,9 +138,7 @@ class BoosterReport(Report):
 
 def write_text(path: Path, text: str) -> None:
     """Atomic: a reader sees the old file or the new one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, text)
 
 
 def jsonable(value: Any) -> Any:

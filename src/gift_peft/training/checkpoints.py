@@ -23,9 +23,10 @@ CHECKSUMS = "checksums.json"
 OPTIMIZER = "optimizer.safetensors"
 RNG = "rng_state.safetensors"
 STATE = "trainer_state.json"
+NEEDED = {"adapter_model.safetensors", OPTIMIZER, RNG, STATE}
 # Temporary names of a run: of what it replaces as a whole, of that inside a checkpoint, and of single files.
 TEMPORARY = re.compile(
-    r"\.+(adapter|adapter-last|checkpoint-\d+)(\.tmp)?\.(tmp|old)|\.(metrics\.jsonl|config\.yaml)\.\d+"
+    r"\.+(adapter|adapter-last|checkpoint-\d+)(\.tmp)?\.(tmp|old)|\.(metrics\.jsonl|config\.yaml)\.\d+\.partial"
 )
 
 
@@ -108,6 +109,8 @@ def checkpoint_fault(folder: Path) -> str | None:
     """What is missing or damaged in a checkpoint, or None."""
     try:
         sums = json.loads((folder / CHECKSUMS).read_text(encoding="utf-8"))
+        if missing := NEEDED - sums.keys():
+            return f"{CHECKSUMS} does not list {min(missing)}"
         for name, digest in sums.items():
             if _digest(folder / name) != digest:
                 return f"{name} is damaged"

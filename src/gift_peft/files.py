@@ -1,0 +1,36 @@
+"""Writing a file so that a reader finds the old one or the new one, whenever the writer is killed."""
+
+import os
+from pathlib import Path
+
+
+def write_whole(path: Path, content: bytes | str) -> None:
+    """Write a file under a temporary name, sync it and rename it; text as UTF-8.
+
+    What killed attempts at it left behind is removed. OSError, always with the file's name: the disk is full, or the
+    folder cannot be written; then the old file is as it was and nothing else remains.
+    """
+    if isinstance(content, str):
+        content = content.encode()
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(partial, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except FileNotFoundError:  # another run wrote the same at the same time and tidied up below
+        if not path.exists():
+            raise
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        # Python knows the file's name only where opening or renaming fails, not where the disk is full.
+        raise type(error)(error.errno, error.strerror, str(path)) from None
+    for leftover in path.parent.glob(f".{_escaped(path.name)}.*.partial"):
+        if leftover.name.removeprefix(f".{path.name}.").removesuffix(".partial").isdigit():  # not of a file "a.b"
+            leftover.unlink(missing_ok=True)
+
+
+def _escaped(name: str) -> str:
+    return "".join(f"[{character}]" if character in "*?[" else character for character in name)

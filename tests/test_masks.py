@@ -329,7 +329,7 @@ BAD = {
     "coco image": ("x.json", coco(image_id=9), "x.json: an annotation for image id 9, which is not listed"),
     "coco absolute": ("x.json", coco("/data/1.jpg"), "x.json: '/data/1.jpg' is an absolute path or climbs"),
     "coco climbs": ("x.json", coco("a/../../1.jpg"), "absolute path or climbs"),
-    "label studio size": ("x.json", tasks(region(points=CORNERS) | {"original_width": 9}), "an image of 8x9"),
+    "label studio size": ("x.json", tasks(region(points=CORNERS) | {"original_width": 9}), "an image of 9x8"),
     "label studio no area": ("x.json", tasks(region("keypointlabels", x=1, y=2)), "'keypointlabels' has no area"),
     "label studio no label": ("x.json", tasks(region() | {"value": {"points": CORNERS}}), "without a label"),
     "label studio cut": ("x.json", tasks(region("brushlabels", rle=[0, 0, 1, 128])), "cut short"),

@@ -6,9 +6,12 @@ import sys
 
 import numpy as np
 import pytest
+from booster_tree import write_predictions, write_root
 from tiny import write_raw_tree
 
-from gift_peft import cli
+from gift_peft import cli, evaluate_booster
+from gift_peft.evaluation.protocols import PROTOCOLS
+from gift_peft.evaluation.results import load_report
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
 pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
@@ -67,6 +70,12 @@ def test_asking_for_help_imports_nothing_heavy():
         ["proxies", "--base", "b"],
         ["proxies", "--base", "b", "--dataset", "d", "--foo"],
         ["evaluate", "--base", "b", "--dataset", "d", "--reference", "sonar"],
+        ["evaluate", "--base", "b"],
+        ["evaluate", "--base", "b", "--dataset", "d", "--booster", "r"],
+        ["evaluate", "--booster", "r"],
+        ["evaluate", "--booster", "r", "--base", "b", "--predictions", "p"],
+        ["evaluate", "--dataset", "d", "--predictions", "p"],
+        ["evaluate", "--booster", "r", "--base", "b", "--occlusion", "some"],
         ["predict", "--base", "b", "--out", "o"],
     ],
 )
@@ -143,6 +152,35 @@ def test_evaluate(trained, base_dir, tree, tmp_path, run):
     best = min(rows[1:], key=lambda row: row["val_gce"])
     assert metrics["gce"]["adapted"] == pytest.approx(best["val_gce"], rel=1e-5)
     assert metrics["gce"]["base"] == pytest.approx(rows[0]["val_gce"], rel=1e-5)
+
+
+def test_evaluate_on_booster(trained, base_dir, tmp_path, run):
+    truths = write_root(tmp_path)
+    write_predictions(tmp_path / "pred", truths)
+    out = ["--out", tmp_path / "e"]
+    adapter = ["--base", base_dir, "--adapter", trained / "adapter"]
+    code, printed, _ = run("evaluate", "--booster", tmp_path, *adapter, "--resize", 1, "--occlusion", "noc", *out)
+    assert code == 0 and "Booster balanced: 2 scenes, 4 images (mm)" in printed and "resolution x1" in printed
+    report = load_report(tmp_path / "e")
+    assert report.adapted and report.about["occlusion"] == "noc" and report.about["adapter"].endswith("adapter")
+    assert (tmp_path / "e" / "report.md").is_file()
+    stored = ["--predictions", tmp_path / "pred", "--protocol", "depth4tom"]
+    code, printed, _ = run("evaluate", "--booster", tmp_path, *stored, *out)
+    assert code == 0 and "Protocol depth4tom" in printed
+    assert load_report(tmp_path / "e").summary == evaluate_booster(
+        tmp_path, predictions=tmp_path / "pred", protocol="depth4tom", progress=False
+    ).summary  # fmt: skip
+    (tmp_path / "pred" / "Scene1" / "camera_00" / "im1.npy").unlink()
+    code, _, err = run("evaluate", "--booster", tmp_path, *stored, *out)
+    assert code == 1 and "1 missing" in err and "Scene1/camera_00/im1" in err
+
+
+def test_evaluate_lists_its_protocols(run):
+    code, out, _ = run("evaluate", "--protocol", "gift", "--list-protocols")
+    assert code == 0
+    assert all(f"\n{name}: " in f"\n{out}" for name in PROTOCOLS)
+    code, _, err = run("evaluate", "--booster", "r", "--predictions", "p", "--protocol", "nobody's")
+    assert code == 1 and "choose one of gift, native, gift-literal, depth4tom" in err
 
 
 def test_predict_and_the_adapter_scale(trained, base_dir, tree, tmp_path, run):

@@ -6,13 +6,15 @@ import shutil
 
 import pytest
 import torch
+from booster_tree import write_root
 from peft import PeftModel
 from runs import arguments, train_again, weights
 from safetensors import SafetensorError
 from safetensors.torch import load_file
-from tiny import tiny_processor, write_group, write_raw_tree
+from tiny import SIZE, tiny_processor, write_group, write_raw_tree
 from transformers import AutoModelForDepthEstimation
 
+from gift_peft import evaluate_booster
 from gift_peft.data.gift_i import load_gift_i
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.losses import geometry_consistency_error
@@ -89,6 +91,23 @@ def test_row_zero_is_the_base(run, groups, base_dir):
     report = evaluate_gift_i(groups("validation"), base, kind="inverse_depth", progress=False)
     assert row["val_gce"] == report.gce["base"]
     assert row["val_tom_rmse"] == report.summary["tom"]["rmse"]
+
+
+def test_booster_is_measured_where_a_root_is_given(base_dir, tree, tmp_path):
+    write_root(tmp_path / "booster")
+    args = arguments(base_dir, tree, tmp_path / "out", max_steps=1, booster_root=str(tmp_path / "booster"))
+    rows = train(args).metrics
+    assert [list(row) for row in rows] == [[*KEYS, "booster_tom_rmse", "booster_other_rmse"]] * 2
+    base = AutoModelForDepthEstimation.from_pretrained(base_dir)
+    options = {"processor": tiny_processor(), "size": SIZE, "progress": False}
+    report = evaluate_booster(tmp_path / "booster", base, **options)
+    assert rows[0]["booster_tom_rmse"] == report.summary["tom"]["rmse"]
+    adapted = PeftModel.from_pretrained(base, tmp_path / "out" / "adapter-last")
+    report = evaluate_booster(tmp_path / "booster", adapted, **options)
+    assert rows[1]["booster_other_rmse"] == report.summary["other"]["rmse"] != report.base["other"]["rmse"]
+    with pytest.raises(FileNotFoundError, match=r"Booster root .*nowhere: no such folder"):
+        train(arguments(base_dir, tree, tmp_path / "none", booster_root=str(tmp_path / "nowhere")))
+    assert not any((tmp_path / "none").iterdir())
 
 
 def test_teacher_is_untouched_and_the_saved_adapter_is_the_trained_one(run, base_dir, groups):

@@ -49,7 +49,7 @@ def load_model(
     """A base model, with an adapter if one is named.
 
     Args:
-        base: folder or hub id.
+        base: folder or hub id; or `da3:<id>`, `moge:<id>` for a model of those packages, which takes no adapter.
         adapter (*optional*): folder or hub id in PEFT format.
         adapter_scale (`float`, *optional*): 0 is the base, 1 the adapter, to the bit.
         revision (`str`, *optional*): of the base.
@@ -65,7 +65,15 @@ def load_model(
     from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
     from gift_peft.adapters import get_recipe, set_adapter_scale
+    from gift_peft.models.external import load_external, split_external
 
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    if split_external(base):
+        if adapter is not None or adapter_scale is not None:
+            raise ValueError(f"base {base}: an adapter needs a model of transformers")
+        model, processor = load_external(base)
+        size = resolve_size(size, None, processor, model.config)
+        return LoadedModel(model.to(device).eval(), processor, size, model.config.prediction_kind)
     try:
         model = AutoModelForDepthEstimation.from_pretrained(base, revision=revision, dtype=torch.float32)
         processor = AutoImageProcessor.from_pretrained(base, revision=revision, backend="pil")
@@ -88,7 +96,6 @@ def load_model(
     elif adapter_scale is not None:
         raise ValueError("adapter_scale needs an adapter")
     size = resolve_size(size, recipe, processor, config)
-    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     return LoadedModel(model.to(device).eval(), processor, size, recipe and recipe.kind_for(config))
 
 
@@ -116,6 +123,8 @@ def prediction_kind(model: Any) -> str:
     config = getattr(model, "config", None)
     if config is None:
         raise ValueError('say what the model predicts: kind="depth" or kind="inverse_depth"')
+    if getattr(config, "prediction_kind", None):  # a model of another package says it itself
+        return config.prediction_kind
     return get_recipe(model).kind_for(config)
 
 

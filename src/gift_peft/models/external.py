@@ -1,0 +1,123 @@
+"""Depth models of other packages, to stand beside ours in a table: `da3:<id>` and `moge:<id>` where a base is named.
+
+Thin: the package (depth-anything-3, or MoGe as dlr-moge) is imported when such a base is asked for, and its network is
+called as a transformers depth model is: `pixel_values` (B,3,H,W) in, `.predicted_depth` (B,H,W) out, in float32. They
+cannot carry a GIFT adapter.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+from transformers import DPTImageProcessorPil
+from transformers.modeling_outputs import DepthEstimatorOutput
+
+SIZE = (476, 644)  # of the paper's backbones; a multiple of the patches of both
+PATCH = 14
+IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+
+
+@dataclass(frozen=True)
+class ExternalConfig:
+    """What the evaluation asks a model's configuration for.
+
+    Args:
+        model_type (`str`): `da3` or `moge`.
+        depth_estimation_type (`str`, *optional*): `metric` where depth is in metres.
+        prediction_kind (`str`): both predict depth.
+        patch_size (`int`): sides of the input are multiples of it.
+    """
+
+    model_type: str
+    depth_estimation_type: str | None = None
+    prediction_kind: str = "depth"
+    patch_size: int = PATCH
+
+
+class ExternalDepth(nn.Module):
+    """`predict` (pixel_values to (B,H,W) depth) of a `network`, called as a transformers depth model is."""
+
+    def __init__(self, network: nn.Module, predict: Callable[[nn.Module, torch.Tensor], torch.Tensor], config) -> None:
+        super().__init__()
+        self.network, self.predict, self.config = network, predict, config
+
+    def forward(self, pixel_values: torch.Tensor) -> DepthEstimatorOutput:
+        return DepthEstimatorOutput(predicted_depth=self.predict(self.network, pixel_values))
+
+
+def split_external(base: Any) -> tuple[str, str] | None:
+    """("da3" or "moge", id) of a base named with such a prefix, else None."""
+    package, colon, name = str(base).partition(":")
+    return (package, name) if colon and package in _LOADERS else None
+
+
+def load_external(base: Any) -> tuple[ExternalDepth, DPTImageProcessorPil]:
+    """The model and an image processor for it.
+
+    Raises ValueError naming the base where its package cannot be imported or reads no such weights, FileNotFoundError
+    where there are none.
+    """
+    package, name = split_external(base)
+    try:
+        return _LOADERS[package](name)
+    except ImportError as error:
+        raise ValueError(f"base {base}: {error}; {_INSTALL[package]}") from None
+    except OSError as error:
+        raise FileNotFoundError(f"base {base}: {_reason(error)}") from None
+    except (RuntimeError, KeyError, TypeError) as error:  # weights of something else
+        raise ValueError(f"base {base}: {_reason(error)}") from None
+
+
+def _reason(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)[:200]
+
+
+# ---- Depth Anything 3 ----
+
+
+def _load_da3(name: str) -> tuple[ExternalDepth, DPTImageProcessorPil]:
+    from depth_anything_3.api import DepthAnything3
+
+    model = DepthAnything3.from_pretrained(name)
+    # Only the nested model scales its depth to metres; the metric one needs the camera's focal length for that.
+    metric = "metric" if "nested" in getattr(model, "model_name", "") else None
+    return ExternalDepth(model.model, _predict_da3, ExternalConfig("da3", metric)), _processor(**IMAGENET)
+
+
+def _predict_da3(network: nn.Module, pixel_values: torch.Tensor) -> torch.Tensor:
+    # The network below its API, which would autocast to half precision; every image is a scene of one view.
+    return network(pixel_values[:, None])["depth"][:, 0]
+
+
+# ---- MoGe ----
+
+
+def _load_moge(name: str) -> tuple[ExternalDepth, DPTImageProcessorPil]:
+    from moge.model import v1, v2
+
+    try:
+        model = v2.MoGeModel.from_pretrained(name)
+    except TypeError:  # a checkpoint of the first version has none of the second's parts
+        model = v1.MoGeModel.from_pretrained(name)
+    metric = "metric" if hasattr(model, "scale_head") else None
+    # MoGe normalises colours itself.
+    return ExternalDepth(model, _predict_moge, ExternalConfig("moge", metric)), _processor(do_normalize=False)
+
+
+def _predict_moge(network: nn.Module, pixel_values: torch.Tensor) -> torch.Tensor:
+    # Unmasked: where MoGe masks, it says infinity, and a mirror is what it may mask.
+    return network.infer(pixel_values, apply_mask=False, use_fp16=False)["depth"]
+
+
+_LOADERS = {"da3": _load_da3, "moge": _load_moge}
+_INSTALL = {
+    "da3": "`pip install depth-anything-3` (which asks for numpy<2: an environment of its own, and --predictions)",
+    "moge": "`pip install dlr-moge`",
+}
+
+
+def _processor(**settings: Any) -> DPTImageProcessorPil:
+    size = {"height": SIZE[0], "width": SIZE[1]}
+    return DPTImageProcessorPil(size=size, ensure_multiple_of=PATCH, keep_aspect_ratio=False, resample=3, **settings)

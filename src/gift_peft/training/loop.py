@@ -36,7 +36,7 @@ from gift_peft.training.groups import PreparedGroups, epoch_order
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
-from gift_peft.training.start import check_run, claim_folder, make_accelerator, stop_signals
+from gift_peft.training.start import check_run, claim_folder, make_accelerator, stop_signals, tell_lost_processes
 from gift_peft.training.state import State, write_metrics
 from gift_peft.training.teacher import load_teacher, make_proxies
 
@@ -64,9 +64,15 @@ def train(args: GiftTrainingArguments) -> TrainResult:
     """Run, or go on with, a training; see `GiftTrainingArguments`.
 
     Raises ValueError, FileNotFoundError or OSError with one line that names the argument, file or group. A NaN stops
-    the run with the group's name; the last checkpoint stays good.
+    the run with the group's name, a process that has died with ConnectionError in the others; the last checkpoint
+    stays good.
     """
     accelerator = make_accelerator(args)
+    with tell_lost_processes(accelerator, Path(args.output_dir)):
+        return _train(args, accelerator)
+
+
+def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult:
     output, checkpoint = check_run(args, accelerator)
     run = Run(args, output, accelerator)
     if args.profile:
@@ -330,8 +336,11 @@ class Run:
     def restore(self, checkpoint: Path) -> State:
         """Weights, optimizer, RNG, progress, metrics.jsonl and the best adapter as they were at a checkpoint."""
         saved = checkpoints.read_state(checkpoint)
-        _check_identity(saved.pop("identity"), self.identity)
-        state = State(**saved)
+        try:
+            before, state = saved.pop("identity"), State(**saved)
+        except (KeyError, TypeError, AttributeError):
+            raise ValueError(f"resume_from_checkpoint: {checkpoint} is of another version of gift-peft") from None
+        _check_identity(before, self.identity)
         if state.step > self.total_steps:
             raise ValueError(f"resume_from_checkpoint: {checkpoint} is past the {self.total_steps} steps of this run")
         checkpoints.read_checkpoint(checkpoint, self.model, self.optimizer)

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
+import torch
 from accelerate import Accelerator, PartialState
 from accelerate.state import AcceleratorState
 from accelerate.utils import ProjectConfiguration, parse_flag_from_env
@@ -20,7 +21,7 @@ from accelerate.utils import ProjectConfiguration, parse_flag_from_env
 from gift_peft.evaluation.results import write_text
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.card import check_push
-from gift_peft.training.checkpoints import find_checkpoint, list_checkpoints, remove_leftovers
+from gift_peft.training.checkpoints import checkpoint_fault, find_checkpoint, list_checkpoints, remove_leftovers
 
 RUN_FILES = ("config.yaml", "metrics.jsonl", "adapter", "adapter-last", "logs")
 
@@ -118,3 +119,23 @@ def stop_signals() -> Iterator[SimpleNamespace]:
     finally:
         for signum, handler in before.items():
             signal.signal(signum, handler)
+
+
+@contextmanager
+def tell_lost_processes(accelerator: Accelerator, output: Path) -> Iterator[None]:
+    """Inside, ConnectionError with the last checkpoint where another process of the run has died (killed, crashed).
+
+    The backend notices when it next waits for that process, and says so as a RuntimeError of several lines.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        backend = isinstance(error, torch.distributed.DistError) or "gloo" in str(error)
+        if accelerator.num_processes == 1 or not backend:
+            raise
+        complete = [str(folder) for folder in list_checkpoints(output) if not checkpoint_fault(folder)]
+        last = f"the last checkpoint is {complete[-1]}" if complete else "no checkpoint had been written yet"
+        raise ConnectionError(
+            f"process {accelerator.process_index} has lost another process of this run, see what that one says; "
+            f"{last}; the same command with --resume_from_checkpoint latest goes on with it"
+        ) from error

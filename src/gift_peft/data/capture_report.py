@@ -1,0 +1,323 @@
+"""`report.html` of a prepared dataset: one file without scripts or links, made from `report.json` (`captures.py`).
+
+Statistics at the top, then a row per group: every frame with its mask's outline, what was done to it and why. The
+flicker box of a group lets its frames alternate with the one they were registered to, which shows a camera that moved
+at once; a warped frame is shown before and after, with its differences from that frame.
+"""
+
+import base64
+import html
+import io
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from gift_peft.data.preprocess import open_image
+from gift_peft.files import write_whole
+
+WIDTH = 240  # of the thumbnails, in pixels
+AMPLIFY = 4  # of the differences
+
+STYLE = """
+:root { color-scheme: light dark; --line: #8885; --good: #2a8a4a; --warn: #b26a00; --bad: #c2332e; --mask: #00e0ff }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 1.5rem auto; max-width: 1500px; padding: 0 1rem }
+h1, h2 { line-height: 1.2; margin: 0 } h2 { font-size: 1.1rem; overflow-wrap: anywhere }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .8rem 0 }
+th, td { border-bottom: 1px solid var(--line); padding: .25rem .7rem; text-align: right }
+td { white-space: nowrap } .scroll { overflow-x: auto }
+th:first-child, td:first-child { text-align: left }
+.index { display: flex; flex-wrap: wrap; gap: .3rem; margin: .8rem 0; padding: 0; list-style: none }
+.tag { border: 1px solid; border-radius: .6rem; font-size: .8rem; padding: 0 .5rem; text-decoration: none }
+.kept, .identity { color: var(--good) } .warped, .warning { color: var(--warn) }
+.rejected, .dropped { color: var(--bad) }
+section { border-top: 1px solid var(--line); margin-top: 1.2rem; padding-top: .8rem }
+section p, section ul { margin: .3rem 0 } .facts { opacity: .75 }
+.strip { display: flex; gap: .8rem; overflow-x: auto; padding: .5rem 0 }
+figure { flex: none; margin: 0 } figcaption { font-size: .82rem; max-width: max(240px, 100%); overflow-wrap: anywhere }
+.shots { display: flex; gap: .3rem } .narrow figcaption { width: 240px } .wide figcaption { width: 960px }
+.shot { background: var(--target, none) 0 0 / 100% 100%; height: max-content; position: relative; width: 240px }
+.shot img { display: block; height: auto; width: 100% }
+.shot svg { height: 100%; inset: 0; position: absolute; width: 100% }
+.shot path { fill: none; stroke: var(--mask); stroke-width: 1.5; vector-effect: non-scaling-stroke }
+.shot .outside { stroke: var(--bad); stroke-dasharray: 4 3 } .shot .proposed { stroke: #ff3df0; stroke-dasharray: 5 2 }
+.shot span { background: #000a; bottom: 0; color: #fff; font-size: .72rem; left: 0; padding: 0 .3rem }
+.shot span { position: absolute }
+.missing { align-items: center; border: 1px dashed; box-sizing: border-box; display: flex; height: 135px;
+  justify-content: center; width: 240px }
+details { margin: .4rem 0 } pre { white-space: pre-wrap; overflow-wrap: anywhere }
+.flicker:checked ~ .strip .blink img { animation: flicker 1s steps(1) infinite }
+@keyframes flicker { 50% { opacity: 0 } }
+"""
+
+FIGURES = {  # of a frame's registration: heading and number format
+    "method": ("method", "s"),
+    "matches": ("matches", "d"),
+    "inliers": ("inliers", "d"),
+    "inlier_ratio": ("inlier ratio", ".2f"),
+    "spread": ("spread", ".2f"),
+    "median_displacement": ("median motion (px)", ".2f"),
+    "target_displacement": ("target moves (px)", ".2f"),
+    "corner_displacement": ("corner moves (px)", ".1f"),
+    "expected_error": ("expected error (px)", ".2f"),
+    "contrast_threshold": ("SIFT contrast", ".3f"),
+    "difference_before": ("difference before", ".2f"),
+    "difference_after": ("after", ".2f"),
+}
+
+
+def write_html(out: Path, report: dict) -> Path:
+    """Write `out/report.html`, whole or not at all, and return it.
+
+    Args:
+        out (`Path`): the prepared folder, whose pictures are embedded as thumbnails.
+        report (`dict`): what `captures.prepare` writes as `report.json`; its docstring has the form. A picture that
+            is not there or cannot be read becomes an empty frame.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    out = Path(out)
+    groups = report["groups"]
+    frames = sum(len(group["frames"]) for group in groups)
+    with tqdm(total=frames, unit="frame", desc="report.html", disable=None, leave=False) as bar:
+        sections = [_group(index, group, out, out / report["raw"], bar) for index, group in enumerate(groups)]
+    title = f"{len(groups)} groups, {frames} frames"
+    page = [
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>Captures: ' + title + "</title>",
+        '<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">',
+        f"<style>{STYLE}</style></head><body>\n<h1>Captures: {title}</h1>",
+        _statistics(report["statistics"]),
+        _index(groups),
+        '<p class="facts">Outlines: <span style="color:var(--mask)">target mask</span>, '
+        '<span style="color:#d33bc8">proposed mask</span>, '
+        '<span style="color:var(--bad)">border of what a warped frame shows</span>.</p>',
+        *sections,
+        "<details><summary>Settings and versions</summary><pre>",
+        _text(json.dumps({key: report.get(key) for key in ("settings", "versions")}, indent=1, ensure_ascii=False)),
+        "</pre></details>\n</body></html>\n",
+    ]
+    write_whole(out / "report.html", "\n".join(page))
+    return out / "report.html"
+
+
+# ---- the top ----
+
+
+def _statistics(statistics: dict) -> str:
+    counts = ("groups", "rejected_groups", "images", "pairs", "references", "warped_frames", "dropped_frames")
+    head = ["split", *(key.partition("_")[0] for key in counts), "images per group", "mask area"]
+    rows = []
+    for split, found in statistics.items():
+        cells = [split, *(_number(found.get(key), "d") for key in counts)]
+        cells.append(_range(found.get("group_size"), 1, ".3g"))
+        rows.append([*cells, _range(found.get("mask_area"), 100, ".2g", " %")])
+    return _table(head, rows)
+
+
+def _range(found: dict | None, factor: float, form: str, unit: str = "") -> str:
+    if not found:
+        return "–"
+    low, high, mean = (_number(factor * found[key], form) for key in ("min", "max", "mean"))
+    return f"{low} – {high}{unit} (mean {mean}{unit})"
+
+
+def _index(groups: list[dict]) -> str:
+    items = [
+        f'<li><a class="tag {_mood(group)}" href="#g{index}">{_text(group["group_id"])}</a></li>'
+        for index, group in enumerate(groups)
+    ]
+    return f'<ul class="index">{"".join(items)}</ul>'
+
+
+def _mood(group: dict) -> str:
+    if group["status"] == "rejected":
+        return "rejected"
+    warned = group["warnings"] or any(frame["warnings"] or frame["reasons"] for frame in group["frames"])
+    return "warning" if warned else "kept"
+
+
+# ---- one group ----
+
+
+def _group(index: int, group: dict, out: Path, raw: Path, bar: tqdm) -> str:
+    frames = group["frames"]
+    target = next((frame for frame in frames if frame["name"] == group["target_frame"]), None)
+    target_image = None if target is None else _picture(target, out, raw)
+    style = f' style="--target:url({_uri(target_image)})"' if target_image is not None else ""
+    proposal = group.get("proposal")
+    size = group.get("size")
+    facts = [group["split"], group.get("surface"), f"{size[0]}×{size[1]}" if size else None, group.get("notes")]
+    facts += [f"{key.replace('_', ' ')} {_number(value)}" for key, value in (group.get("quality") or {}).items()]
+    if proposal:
+        facts.append(
+            f"masks proposed with score {_number(proposal.get('score'))}, "
+            + ("accepted" if proposal.get("accepted") else "not accepted: not used")
+        )
+    parts = [
+        f'<section id="g{index}"{style}>',
+        f'<h2>{_text(group["group_id"])} <span class="tag {_mood(group)}">{_text(group["status"])}</span></h2>',
+        f'<p class="facts">{" · ".join(_text(fact) for fact in facts if fact)}</p>',
+        _remarks(group["reasons"], "rejected"),
+        _remarks(group["warnings"], "warning"),
+        f'<input type="checkbox" class="flicker" id="f{index}"><label for="f{index}"> flicker against '
+        f"{_text(target['name'])}</label>"
+        if target_image is not None
+        else "",
+        '<div class="strip">',
+    ]
+    for frame in frames:
+        parts.append(_frame(frame, group, target_image, out, raw))
+        bar.update()
+    return "\n".join([*parts, "</div>", _registrations(frames), "</section>"])
+
+
+def _frame(frame: dict, group: dict, target: Image.Image | None, out: Path, raw: Path) -> str:
+    image = _picture(frame, out, raw)
+    is_target = frame["name"] == group["target_frame"]
+    blink = "" if is_target or target is None else " blink"
+    outlines = [
+        _outline(frame.get("mask"), out, ""),
+        _outline(frame.get("valid"), out, "outside"),
+        _outline(_proposed(frame, group), out, "proposed"),
+    ]
+    wide = frame["status"] == "warped" and image is not None and target is not None
+    if wide:
+        before = _thumbnail(raw / frame["original"])
+        shots = [_shot(before, "before", blink), _shot(image, "after", blink, outlines)]
+        shots += [
+            _shot(_difference(shown, target), f"{AMPLIFY} × difference {label}")
+            for shown, label in ((before, "before"), (image, "after"))
+        ]
+    else:
+        shots = [_shot(image, frame["role"] if frame["role"] != "observation" else "", blink, outlines)]
+    status = "registered to" if is_target and group["status"] == "kept" else frame["status"]
+    moved = (frame.get("registration") or {}).get("median_displacement")
+    facts = [f"{key.replace('_', ' ')} {_number(value)}" for key, value in (frame.get("quality") or {}).items()]
+    return (
+        f'<figure class="{"wide" if wide else "narrow"}"><div class="shots">{"".join(shots)}</div>'
+        f'<figcaption><b>{_text(frame["name"])}</b> <span class="tag {frame["status"]}">{_text(status)}</span>'
+        + (f" moved {_number(moved, '.2f')} px" if moved is not None else "")
+        + _remarks(frame["reasons"], "dropped")
+        + _remarks(frame["warnings"], "warning")
+        + f'<div class="facts">{_text(" · ".join(facts))}</div></figcaption></figure>'
+    )
+
+
+def _registrations(frames: list[dict]) -> str:
+    """Every figure of every frame's registration, and what the paper's rule alone would have said."""
+    rows = []
+    for frame in frames:
+        found = frame.get("registration")
+        if found:
+            paper = found.get("paper_exact") or {}
+            verdict = {True: "accepts", False: "refuses"}.get(paper.get("accepted"), "–")
+            moved = paper.get("corner_displacement")
+            verdict += f", corner {_number(moved, '.1f')} px" if moved is not None else ""
+            cells = [_number(found.get(key), form) for key, (_, form) in FIGURES.items()]
+            rows.append([frame["name"], *cells, verdict])
+    if not rows:
+        return ""
+    head = ["frame", *(heading for heading, _ in FIGURES.values()), "the paper's rule alone"]
+    return f"<details><summary>Registration figures</summary>{_table(head, rows)}</details>"
+
+
+# ---- pictures ----
+
+
+def _thumbnail(path: Path) -> Image.Image | None:
+    """RGB, WIDTH wide; None if the file cannot be read."""
+    try:
+        image = open_image(path)
+        size = WIDTH, max(1, round(WIDTH * image.height / image.width))
+        return image.convert("RGB").resize(size, Image.Resampling.BOX, reducing_gap=2)
+    except (OSError, ValueError):
+        return None
+
+
+def _picture(frame: dict, out: Path, raw: Path) -> Image.Image | None:
+    return _thumbnail(out / frame["prepared"] if frame.get("prepared") else raw / frame["original"])
+
+
+def _difference(image: Image.Image | None, target: Image.Image) -> Image.Image | None:
+    if image is None or image.size != target.size:
+        return None
+    grey = [np.asarray(picture.convert("L"), np.int16) for picture in (image, target)]
+    return Image.fromarray(np.clip(AMPLIFY * np.abs(grey[0] - grey[1]), 0, 255).astype(np.uint8)).convert("RGB")
+
+
+def _shot(image: Image.Image | None, label: str, blink: str = "", outlines: Iterable[str] = ()) -> str:
+    if image is None:
+        return '<div class="missing">no picture</div>'
+    paths = "".join(outlines)
+    overlay = f'<svg viewBox="0 0 1 1" preserveAspectRatio="none">{paths}</svg>' if paths else ""
+    caption = f"<span>{_text(label)}</span>" if label else ""
+    size = f'width="{image.width}" height="{image.height}"'
+    picture = f'<img src="{_uri(image)}" {size} alt="{_text(label)}">'
+    return f'<div class="shot{blink}">{picture}{overlay}{caption}</div>'
+
+
+def _uri(image: Image.Image) -> str:
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=75)
+    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def _proposed(frame: dict, group: dict) -> str | None:
+    """The proposed mask of a frame; one that is in use is already drawn as the mask."""
+    proposal = group.get("proposal") or {}
+    masks = proposal.get("masks") or []
+    if proposal.get("accepted") or frame["role"] != "observation" or not masks:
+        return None
+    stem = Path(frame["name"]).stem
+    return next((mask for mask in masks if Path(mask).stem == stem), masks[0])
+
+
+def _outline(path: str | None, out: Path, kind: str) -> str:
+    """An SVG path round a mask's regions, in fractions of the image; nothing for a mask that cannot be read."""
+    if path is None:
+        return ""
+    try:
+        mask = np.asarray(open_image(out / path)) > 0
+    except (OSError, ValueError):
+        return ""
+    if mask.all():  # its border would be the picture's
+        return ""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    tolerance = max(mask.shape) / WIDTH / 2
+    size = np.array(mask.shape[::-1])
+    drawn = []
+    for contour in contours:
+        points = (cv2.approxPolyDP(contour, tolerance, True)[:, 0] + 0.5) / size
+        drawn.append("M" + " ".join(f"{x:.4g},{y:.4g}" for x, y in points) + "Z")
+    return f'<path class="{kind}" d="{"".join(drawn)}"/>' if drawn else ""
+
+
+# ---- words ----
+
+
+def _remarks(remarks: list[dict], kind: str) -> str:
+    items = "".join(f'<li class="{kind}">{_text(remark["text"])}</li>' for remark in remarks)
+    return f"<ul>{items}</ul>" if items else ""
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = ["".join(f"<th>{_text(cell)}</th>" for cell in head)]
+    lines += ["".join(f"<td>{_text(cell)}</td>" for cell in row) for row in rows]
+    return f'<div class="scroll"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
+
+
+def _number(value, form: str = ".3g") -> str:
+    if value is None:
+        return "–"
+    if not isinstance(value, int | float) or form == "s":
+        return str(value)
+    return format(round(value) if form == "d" else value, form)
+
+
+def _text(value) -> str:
+    return html.escape(str(value))

@@ -37,6 +37,15 @@ def test_yamls_bare_no_is_the_word(tmp_path):
     assert (args.mixed_precision, args.push_to_hub) == ("no", False)
 
 
+@pytest.mark.parametrize("name", ["--checkpoint_at_steps", "--checkpoint-at-steps"])
+@pytest.mark.parametrize("words", [["10000,20000"], ["10000", "20000"], ["10000,", "20000"]])
+def test_steps_with_commas_or_spaces(name, words):
+    assert parse_arguments([*REQUIRED, name, *words]).checkpoint_at_steps == [10000, 20000]
+    assert parse_arguments([*REQUIRED, f"{name}=10000,20000"]).checkpoint_at_steps == [10000, 20000]
+    with pytest.raises(ValueError, match="checkpoint_at_steps: expected numbers of updates, got 'a,5'"):
+        parse_arguments([*REQUIRED, name, "a,5"])
+
+
 def test_config_yaml_of_a_run_reads_back(tmp_path):
     args = parse_arguments([*REQUIRED, "--checkpoint_at_steps", "3", "--retain", "4", "--size", "56x70"])
     again = parse_arguments(write(tmp_path / "c.yaml", args.to_yaml()))

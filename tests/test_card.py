@@ -11,6 +11,7 @@ from runs import arguments, train_again
 from tiny import write_raw_tree
 
 from gift_peft.evaluation import cards
+from gift_peft.evaluation.card_metadata import base_license, is_local, portable_name
 from gift_peft.evaluation.metrics import METRICS
 from gift_peft.training import GiftTrainingArguments, card, loop, start, train
 
@@ -54,12 +55,12 @@ def test_metadata_on_the_hub(tmp_path):
 
 def test_a_licence_may_be_stated(tmp_path):
     assert make(tmp_path, ROW, license="mit").data.license == "mit"
-    assert cards.base_license("someone/unknown") == "other"
+    assert base_license("someone/unknown") == "other"
     (tmp_path / "README.md").write_text("---\nlicense: bsd-2-clause\n---\n")
-    assert cards.base_license(str(tmp_path)) == "bsd-2-clause"
+    assert base_license(str(tmp_path)) == "bsd-2-clause"
     for broken in (b"---\nlicense: [a\n: b\n---\n", b"---\nlicense: \xff\n---\n"):
         (tmp_path / "README.md").write_bytes(broken)
-        assert cards.base_license(str(tmp_path)) == "other"
+        assert base_license(str(tmp_path)) == "other"
 
 
 def test_without_validation_nothing_is_claimed(tmp_path):
@@ -165,8 +166,8 @@ def test_push_is_checked_before_anything_is_loaded(base_dir, tree, tmp_path, mon
 )
 def test_hub_ids_and_paths(name, local, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert cards.is_local(name) is local
+    assert is_local(name) is local
     (tmp_path / "model").mkdir()
-    assert cards.is_local("model")
-    assert cards.portable_name("owner/model") == "owner/model"
-    assert cards.portable_name(str(tmp_path / "model")) == "model"
+    assert is_local("model")
+    assert portable_name("owner/model") == "owner/model"
+    assert portable_name(str(tmp_path / "model")) == "model"

@@ -1,11 +1,12 @@
 """The paper's Table 3: runs that differ in their loss weights, each at its checkpoint with the smallest GCE."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from gift_peft.evaluation.curves import DIVERGED
 from gift_peft.evaluation.layout import Cell, Table, value_cell
 from gift_peft.evaluation.protocols import PROTOCOLS
-from gift_peft.evaluation.results import BoosterReport
+from gift_peft.evaluation.results import BoosterReport, GiftIReport
 from gift_peft.evaluation.runs import SavedRun, ratio
 from gift_peft.evaluation.tables import protocol_note, skipped_note
 
@@ -72,16 +73,17 @@ def _collapsed(run: SavedRun, row: dict) -> bool:
 
 def _notes(runs: Sequence[SavedRun], collapsed: bool) -> list[str]:
     notes = [f"GIFT-I: the validation of training, in proxy units. Protocol {PROTOCOLS['native'].describe()}."]
-    skipped = {ratio(run): run.best_row().get("val_skipped") for run in runs}
-    images = runs[0].best_row().get("val_images")
-    if None not in (images, *skipped.values()):
-        counts = sorted(set(skipped.values()))
-        text = str(counts[0]) if len(counts) == 1 else ", ".join(f"{n} ({name})" for name, n in skipped.items())
-        notes.append(f"Skipped: {text} of {images} images.")
+    reports = [report for run in runs for report in run.evaluations.values()]
+    proxies = [r for r in reports if isinstance(r, GiftIReport) and r.reference == "proxy"]
+    notes += dict.fromkeys(map(skipped_note, proxies))
+    if not proxies:
+        notes.append("Skipped images are counted by `gift-peft evaluate`; these runs have no such evaluation.")
+    if any(run.best_row().get("booster_tom_rmse") is not None for run in runs):
+        logged = replace(PROTOCOLS["gift"], resolution=0.25)
+        notes.append(f"Booster: measured in training. Protocol {logged.describe()}.")
     else:
-        notes.append("Skipped: not in these runs' metrics.jsonl; `gift-peft evaluate` of each adapter counts them.")
-    boosters = [report for run in runs for report in run.evaluations.values() if isinstance(report, BoosterReport)]
-    notes += dict.fromkeys(f"Booster: {line}" for r in boosters for line in (protocol_note(r), skipped_note(r)))
+        boosters = [report for report in reports if isinstance(report, BoosterReport)]
+        notes += dict.fromkeys(f"Booster: {line}" for r in boosters for line in (protocol_note(r), skipped_note(r)))
     if collapsed:
         notes.append(f"{COLLAPSED} collapsed: Other RMSE more than {DIVERGED:g} times the base's; not compared.")
     return notes

@@ -127,11 +127,18 @@ def run_report(
 
 
 def _write_card(run: SavedRun, path: Path) -> Path:
-    reports = [report for report in run.evaluations.values() if report.adapted]
+    reports = [report for report in run.evaluations.values() if _is_of_adapter(run, report)]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, model_card(run.arguments, run.record, reports))
     print(f"Model card: {path}")
     return path
+
+
+def _is_of_adapter(run: SavedRun, report: AnyReport) -> bool:
+    """Whether an evaluation is of the run's adapter as it is: not scaled, and not of another that lies elsewhere."""
+    other = Path(report.about.get("adapter") or "")
+    elsewhere = run.adapter is not None and other.is_dir() and not other.samefile(run.adapter)
+    return report.adapted and report.about.get("adapter_scale") in (None, 1) and not elsewhere
 
 
 def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from gift_peft.evaluation.cards import portable_name
+from gift_peft.evaluation.card_metadata import portable_name
 from gift_peft.evaluation.results import load_report
 from gift_peft.evaluation.tables import AnyReport
 

@@ -105,8 +105,9 @@ class GiftTrainingArguments:
     profile: int = _arg("time this many updates, print where the time goes, and stop", 0)
     checkpointing_steps: int | None = _arg("a checkpoint every so many updates; default: every epoch", None)
     checkpoints_total_limit: int | None = _arg("how many of the newest checkpoints are kept", 2)
-    checkpoint_at_steps: list[int] = field(
-        default_factory=list, metadata={"help": "updates after which a checkpoint is written and never deleted"}
+    checkpoint_at_steps: list[str] = field(
+        default_factory=list,
+        metadata={"help": "updates after which a checkpoint is written and never deleted: 10000,20000 or 10000 20000"},
     )
     resume_from_checkpoint: str | None = _arg(
         "a checkpoint-<step> folder, or latest: the newest complete one in output_dir", None
@@ -151,6 +152,12 @@ class GiftTrainingArguments:
                 raise ValueError(f"{name}: must be at least 0 and below 1, got {getattr(self, name)}")
         if self.seed >= 2**32:
             raise ValueError(f"seed: must be below 2**32, got {self.seed}")
+        try:
+            words = [word for step in self.checkpoint_at_steps for word in str(step).split(",") if word.strip()]
+            self.checkpoint_at_steps = [int(word) for word in words]
+        except ValueError:
+            given = " ".join(map(str, self.checkpoint_at_steps))
+            raise ValueError(f"checkpoint_at_steps: expected numbers of updates, got {given!r}") from None
         if any(step < 1 for step in self.checkpoint_at_steps):
             raise ValueError(f"checkpoint_at_steps: must be at least 1, got {min(self.checkpoint_at_steps)}")
         if self.snapshot_micro_batch_size is not None and self.retain == "auto":

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from gift_peft.evaluation.cards import is_local, portable_name
+from gift_peft.evaluation.card_metadata import is_local, portable_name
 from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 
 UPLOADED = ["adapter_model.safetensors", "adapter_config.json", "gift.json", "preprocessor_config.json", "README.md"]

@@ -1,9 +1,12 @@
 """Short training runs on the tiny tree, and what they leave on disk."""
 
 import multiprocessing
+import os
+import socket
 from pathlib import Path
 
 import torch
+from accelerate.state import AcceleratorState
 from safetensors.torch import load_file
 
 from gift_peft.training import GiftTrainingArguments, TrainResult, train
@@ -35,6 +38,27 @@ def run_in_child(function, *args) -> int:
     process.start()
     process.join()
     return process.exitcode
+
+
+def run_in_processes(function, count: int = 2) -> list[int]:
+    """Exit codes of `function(rank)` in forked processes that train together; negative for a signal."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def work(rank):
+        setting = {"WORLD_SIZE": count, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "ACCELERATE_USE_CPU": "true"}
+        os.environ.update({key: str(value) for key, value in (setting | {"RANK": rank, "LOCAL_RANK": rank}).items()})
+        AcceleratorState._reset_state(reset_partial_state=True)  # the parent's, inherited by the fork
+        function(rank)
+
+    context = multiprocessing.get_context("fork")
+    processes = [context.Process(target=work, args=(rank,)) for rank in range(count)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    return [process.exitcode for process in processes]
 
 
 def train_again(args: GiftTrainingArguments, **changes) -> TrainResult:

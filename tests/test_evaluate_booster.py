@@ -1,6 +1,8 @@
 """`evaluate_booster` against a straight-line evaluator, hand-computed scenes, and the traps of other evaluators."""
 
 import json
+import subprocess
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -272,6 +274,15 @@ def test_reports_are_saved_and_loaded(tmp_path):
     )  # fmt: skip
     with pytest.raises(FileNotFoundError, match=r"metrics\.json is missing"):
         load_report(tmp_path)
+
+
+@pytest.mark.slow
+def test_the_benchmark_runs(tmp_path):
+    script = Path(__file__).parents[1] / "examples" / "benchmark_booster.py"
+    options = ["--scenes", "2", "--images", "3", "--size", "60x80", "--folder", tmp_path]
+    done = subprocess.run([sys.executable, script, *map(str, options)], capture_output=True, text=True, check=True)
+    assert "Booster balanced: 2 scenes, 3 images (mm)" in done.stdout
+    assert "3 images of 60x80 in" in done.stdout and "peak memory" in done.stdout
 
 
 # ---- real data ----

@@ -15,7 +15,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run a verb and leave through `sys.exit`."""
     parser = _parser()
     args, rest = parser.parse_known_args(argv)
-    if rest and args.verb not in ("demo", "train"):
+    if rest and args.verb not in ("demo", "prepare", "train"):
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     debug = args.debug or os.environ.get("GIFT_PEFT_DEBUG", "0") not in ("", "0")
     try:
@@ -61,7 +61,15 @@ def _parser() -> argparse.ArgumentParser:
     proxies.add_argument("--proxies_dir", help="default: DATASET/proxies")
     proxies.add_argument("--overwrite", action="store_true", help="make every proxy again")
 
-    # Its own parser knows the arguments (`gift-peft train --help`).
+    export = verb("export", _export, "a dataset as parquet shards with a card, to share or stream")
+    export.add_argument("dataset", metavar="OUT", help="GIFT-I, for example what `gift-peft prepare` wrote")
+    export.add_argument("folder", metavar="DST", help="new folder; upload it with `hf upload`")
+    export.add_argument("--format", choices=["parquet"], default="parquet")
+    export.add_argument("--max-shard-size", default="500MB", metavar="SIZE", help="for example 1GB (default: 500MB)")
+    export.add_argument("--license", help="for the card; default: the one that the dataset's card states")
+
+    # Their own parsers know the arguments (`gift-peft prepare --help`).
+    verb("prepare", _prepare, "from a folder of photos to a checked dataset, with a report", add_help=False)
     verb("train", _train, "fine-tune a model on groups of images into an adapter", add_help=False)
 
     evaluate = verb("evaluate", _evaluate, "compare base and adapter on validation groups, or on Booster")
@@ -171,6 +179,20 @@ def _proxies(args: argparse.Namespace, rest: list[str]) -> int:
         overwrite=args.overwrite,
     )
     print(f"Proxies: {folder}")
+    return 0
+
+
+def _prepare(args: argparse.Namespace, rest: list[str]) -> int:
+    from gift_peft.data.prepare_arguments import run
+
+    return run(rest)
+
+
+def _export(args: argparse.Namespace, rest: list[str]) -> int:
+    from gift_peft.data.export import export_parquet
+
+    folder = export_parquet(args.dataset, args.folder, args.max_shard_size, args.license)
+    print(f"Dataset: {folder}")
     return 0
 
 

@@ -10,9 +10,10 @@ format            1
 raw               RAW, relative to OUT
 settings          {"registration": {threshold: value}, "quality": {threshold: value}, and the other arguments}
 versions          {"gift-peft", "opencv", "numpy", "pillow", "python"}
+removed           group ids ("train/a") that an earlier run had made and that RAW no longer has
 statistics        {"train" | "validation": {"groups", "images", "pairs", "references", "rejected_groups",
                   "dropped_frames", "warped_frames", "group_size": {"min", "max", "mean"} or null,
-                  "mask_area": {"min", "max", "mean"} (fraction of the image) or null}}; a split without groups is absent
+                  "mask_area": {"min", "max", "mean"} (fraction of the image) or null}}; no empty splits
 groups            list, in the order of the dataset, of:
   group_id        string
   split           "train" | "validation"
@@ -24,13 +25,13 @@ groups            list, in the order of the dataset, of:
   warnings        list of {"code", "text"} about the group as a whole
   size            [width, height] | null (unreadable)
   target_frame    name of the observation that the others are registered to | null
-  quality         {"outside_change", "target_change", "mask_area", "mask_iou", ...}: measured figures, null if not measurable
+  quality         {"outside_change", "target_change", "mask_area", "mask_iou"}, null where not measurable
   proposal        null | {"score", "accepted", "refined", "masks": [paths of masks_proposed/..., relative to OUT],
-                  "mask_area", ...}
+                  "mask_area", and the other figures of `proposals.Proposal`}
   frames          list, natural order, the treated reference last, of:
     name          the image's path inside the group's folder (what `image_names` holds)
     role          "observation" | "reference"
-    status        "kept" (the frame that others are registered to, or a frame not yet judged when its group was rejected)
+    status        "kept" (the frame that others are registered to, or one not judged when its group was rejected)
                   | "identity" (camera did not move: not resampled) | "warped" | "dropped"
     reasons       list of {"code", "text"}: why dropped, [] otherwise
     warnings      list of {"code", "text"}
@@ -43,8 +44,319 @@ groups            list, in the order of the dataset, of:
                   "matches", "inliers", "inlier_ratio", "spread", "median_displacement", "corner_displacement",
                   "target_displacement", "expected_error" (px at the target's corners), "contrast_threshold",
                   "difference_before", "difference_after" (mean absolute grey difference outside the target, 0-255),
-                  "paper_exact": {"accepted": bool, "matches", "inliers", "inlier_ratio", "corner_displacement"}}; any
-                  figure may be null
-    quality       null | {"sharpness", "clipped_dark", "clipped_bright", "outside_change", "mask_area", ...}
+                  "paper_exact": {"accepted": bool, "matches", "inliers", "inlier_ratio", "corner_displacement"},
+                  with --paper-exact also "with_additions": {"status", "reasons"}}; any figure may be null
+    quality       null | {"sharpness" (relative to the group's median), "clipped_dark", "clipped_bright",
+                  "outside_change", "outside_correlation", "target_change", "mask_area", "mask_border", "mask_iou"}
 ```
 """
+
+import json
+import os
+import platform
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import numpy as np
+import PIL
+from tqdm import tqdm
+
+import gift_peft
+from gift_peft.data.capture_group import FORMAT, Job, Outcome, PrepareSettings, prepare_group
+from gift_peft.data.raw import SPLITS, find_groups
+from gift_peft.data.writer import write_card, write_rows
+from gift_peft.files import write_whole
+
+STATE = ".prepare"  # in OUT: one record per finished group, and groups on their way
+BESIDE = ("masks_proposed", "proxies_given")  # what a group may leave in OUT besides its folder
+
+
+def prepare(
+    raw: str | Path,
+    out: str | Path,
+    settings: PrepareSettings | None = None,
+    *,
+    num_proc: int = 1,
+    license: str = "unknown",
+    pretty_name: str | None = None,
+) -> dict:
+    """Make a prepared GIFT-I folder of a raw tree and return the report.
+
+    RAW is only read. Groups come into OUT one by one, each whole or not at all; what was finished earlier with the
+    same files and settings is not done again. A group with something wrong is rejected in the report and the others
+    are made. At the end OUT holds exactly what RAW gives.
+
+    Args:
+        raw (`str` or `Path`): the raw tree, or whatever `settings.layout` describes.
+        out (`str` or `Path`): new, empty, or made by this function before; neither inside RAW nor around it.
+        settings (`PrepareSettings`, *optional*): thresholds and choices.
+        num_proc (`int`): processes that prepare groups side by side.
+        license, pretty_name (`str`): for the dataset card.
+
+    Raises:
+        ValueError, FileNotFoundError: one line; `raw` or `out` is not what it should be. What concerns one group
+            never raises.
+    """
+    raw, out = Path(raw), Path(out)
+    settings = settings or PrepareSettings()
+    if num_proc < 1:
+        raise ValueError(f"num_proc: at least 1, got {num_proc}")
+    _check_places(raw, out)
+    groups = settings.layout.find(raw) if settings.layout is not None else find_groups(raw)
+    staging = out / STATE / "staging"
+    shutil.rmtree(staging, ignore_errors=True)
+    staging.mkdir(parents=True)
+    jobs = [Job(raw, staging, source, split, settings) for split in SPLITS for source in groups.get(split, [])]
+    _check_names(jobs)
+    records = {(job.split, job.group_id): _read_record(out, job) for job in jobs}
+    removed = _remove_others(out, records.keys())
+    kept = {key: record["row"] for key, record in records.items() if record and record["row"]}
+    _write_rows(out, kept, jobs)
+    jobs = [replace(job, known=(records[job.split, job.group_id] or {}).get("digest")) for job in jobs]
+    with tqdm(total=len(jobs), desc="groups", unit="group", disable=None) as bar:
+        for job, outcome in _run(jobs, num_proc):
+            if not outcome.unchanged:
+                key = job.split, job.group_id
+                if kept.pop(key, None):  # first the table, then the files: the table never names what is not there
+                    _write_rows(out, kept, jobs)
+                _install(out, job, outcome)
+                if outcome.row is not None:
+                    kept[key] = outcome.row
+                    _write_rows(out, kept, jobs)
+                records[key] = _write_record(out, job, outcome)
+            bar.update()
+    shutil.rmtree(staging, ignore_errors=True)
+    entries = [records[job.split, job.group_id]["entry"] for job in jobs]
+    report = _report(raw, out, settings, entries, removed)
+    if kept:
+        write_card(_rows(kept, jobs), out, license, pretty_name or f"GIFT-I: {raw.resolve().name}", _describe(report))
+    else:
+        for name in ("README.md", "groups.jsonl"):
+            (out / name).unlink(missing_ok=True)
+    write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False))
+    from gift_peft.data.capture_report import write_html
+
+    write_html(out, report)
+    return report
+
+
+def _check_places(raw: Path, out: Path) -> None:
+    if not raw.is_dir():
+        raise FileNotFoundError(f"RAW {raw}: no such folder")
+    there, here = raw.resolve(), out.resolve()
+    if here == there or here.is_relative_to(there) or there.is_relative_to(here):
+        raise ValueError(f"OUT {out}: it must lie neither inside RAW nor around it; RAW is left as it is")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"OUT {out}: not a folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / STATE).is_dir():
+        raise ValueError(f"OUT {out}: not empty, and not made by gift-peft prepare; name a new folder")
+
+
+def _check_names(jobs: list[Job]) -> None:
+    seen: dict[tuple[str, str], Job] = {}
+    for job in jobs:
+        # Some file systems fold case: two such groups would share a folder there.
+        other = seen.setdefault((job.split, job.group_id.casefold()), job)
+        if other is not job:
+            raise ValueError(f"{job.folder} and {other.folder}: two groups with one name; rename one")
+
+
+def _run(jobs: list[Job], num_proc: int) -> Iterator[tuple[Job, Outcome]]:
+    """Every job with its outcome, as they finish."""
+    if num_proc == 1 or len(jobs) < 2:
+        threads = cv2.getNumThreads()
+        try:
+            for job in jobs:
+                yield job, prepare_group(job)
+        finally:
+            cv2.setNumThreads(threads)
+        return
+    # Started anew, not forked: OpenCV's and torch's threads do not survive a fork.
+    pool = ProcessPoolExecutor(min(num_proc, len(jobs)), mp_context=get_context("spawn"))
+    try:
+        futures = {pool.submit(prepare_group, job): job for job in jobs}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BrokenProcessPool:
+        raise OSError(
+            "a process of gift-peft prepare was killed, perhaps for memory; run it again with fewer (--num-proc), "
+            "finished groups are kept"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+# ---- what is in OUT ----
+
+
+def _record_path(out: Path, split: str, group_id: str) -> Path:
+    return out / STATE / split / f"{group_id}.json"
+
+
+def _read_record(out: Path, job: Job) -> dict | None:
+    """What an earlier run noted about a group, if everything it made is still there."""
+    path = _record_path(out, job.split, job.group_id)
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if record["format"] != FORMAT or record["digest"] is None:
+            return None
+        whole = all((out / name).stat().st_size == size for name, size in record["files"].items())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return record if whole else None
+
+
+def _write_record(out: Path, job: Job, outcome: Outcome) -> dict:
+    """Last of all steps of a group: only what has a record is finished."""
+    places = [out / job.split / job.group_id, *(out / name / job.split / job.group_id for name in BESIDE)]
+    files = {
+        path.relative_to(out).as_posix(): path.stat().st_size
+        for place in places
+        for path in sorted(place.rglob("*"))
+        if path.is_file()
+    }
+    record = {
+        "format": FORMAT,
+        "digest": outcome.digest,
+        "row": outcome.row,
+        "entry": outcome.entry,
+        "files": files,
+    }
+    write_whole(_record_path(out, job.split, job.group_id), json.dumps(record, allow_nan=False))
+    return record
+
+
+def _install(out: Path, job: Job, outcome: Outcome) -> None:
+    """Put a staged group, and what belongs beside it, in the place of what was there."""
+    _record_path(out, job.split, job.group_id).unlink(missing_ok=True)
+    for place in (Path(job.split), *(Path(name) / job.split for name in BESIDE)):
+        made, target = job.staging / place / job.group_id, out / place / job.group_id
+        if place == Path(job.split) and outcome.row is None:
+            shutil.rmtree(made, ignore_errors=True)
+        shutil.rmtree(target, ignore_errors=True)
+        if made.is_dir():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(made, target)
+
+
+def _remove_others(out: Path, wanted) -> list[str]:
+    """Take out of OUT what earlier runs made of groups that are gone from RAW; which these were."""
+    removed = []
+    for split in SPLITS:
+        for path in sorted((out / STATE / split).glob("*.json")):
+            if (split, path.stem) in wanted:
+                continue
+            removed.append(f"{split}/{path.stem}")
+    if removed:
+        # Tables first, as everywhere; the caller writes the new ones.
+        for split in SPLITS:
+            (out / split / "metadata.parquet").unlink(missing_ok=True)
+    for name in removed:
+        for place in (out, *(out / beside for beside in BESIDE)):
+            shutil.rmtree(place / name, ignore_errors=True)
+        (out / STATE / f"{name}.json").unlink()
+    return removed
+
+
+def _rows(kept: dict[tuple[str, str], dict], jobs: list[Job]) -> dict[str, dict[str, dict]]:
+    """By split and group id, in the order of RAW."""
+    rows: dict[str, dict[str, dict]] = {split: {} for split in SPLITS}
+    for job in jobs:
+        if row := kept.get((job.split, job.group_id)):
+            rows[job.split][job.group_id] = row
+    return rows
+
+
+def _write_rows(out: Path, kept: dict, jobs: list[Job]) -> None:
+    write_rows(_rows(kept, jobs), out)
+
+
+# ---- the report ----
+
+
+def _report(raw: Path, out: Path, settings: PrepareSettings, entries: list[dict], removed: list[str]) -> dict:
+    return {
+        "format": FORMAT,
+        "raw": Path(os.path.relpath(raw.resolve(), out.resolve())).as_posix(),
+        "settings": asdict(settings),
+        "versions": {
+            "gift-peft": gift_peft.__version__,
+            "opencv": cv2.__version__,
+            "numpy": np.__version__,
+            "pillow": PIL.__version__,
+            "python": platform.python_version(),
+        },
+        "removed": removed,
+        "statistics": {
+            split: _statistics([entry for entry in entries if entry["split"] == split])
+            for split in SPLITS
+            if any(entry["split"] == split for entry in entries)
+        },
+        "groups": entries,
+    }
+
+
+def _statistics(entries: list[dict]) -> dict:
+    kept = [entry for entry in entries if entry["status"] == "kept"]
+    frames = [frame for entry in kept for frame in entry["frames"]]
+    sizes = [
+        sum(frame["role"] == "observation" and frame["status"] != "dropped" for frame in entry["frames"])
+        for entry in kept
+    ]
+    areas = [frame["quality"]["mask_area"] for frame in frames if frame["mask"] is not None]
+    return {
+        "groups": len(kept),
+        "images": sum(sizes),
+        "pairs": sum(size * (size - 1) // 2 for size in sizes),
+        "references": sum(frame["role"] == "reference" and frame["status"] != "dropped" for frame in frames),
+        "rejected_groups": len(entries) - len(kept),
+        "dropped_frames": sum(frame["status"] == "dropped" for frame in frames),
+        "warped_frames": sum(frame["status"] == "warped" for frame in frames),
+        "group_size": _range(sizes),
+        "mask_area": _range(areas),
+    }
+
+
+def _range(values: list) -> dict | None:
+    return {"min": min(values), "max": max(values), "mean": float(np.mean(values))} if values else None
+
+
+def _describe(report: dict) -> str:
+    """The card's text: what was done, and the statistics."""
+    lines = [
+        "Groups for GIFT fine-tuning of monocular depth models, made from photos by `gift-peft prepare`: "
+        "registered to the last observation of each group and checked. `report.html` says what was done with each "
+        "frame, and why.",
+        "",
+        "| split | groups | images | group size | pairs | references | mask area | rejected groups | dropped frames "
+        "| warped frames |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for split, found in report["statistics"].items():
+        size, area = found["group_size"], found["mask_area"]
+        size = "" if size is None else f"{size['min']}-{size['max']}, mean {size['mean']:.2f}"
+        area = "" if area is None else f"{area['min']:.1%}-{area['max']:.1%}, mean {area['mean']:.1%}"
+        lines.append(
+            f"| {split} | {found['groups']} | {found['images']} | {size} | {found['pairs']} | {found['references']} "
+            f"| {area} | {found['rejected_groups']} | {found['dropped_frames']} | {found['warped_frames']} |"
+        )
+    accepted = [entry for entry in report["groups"] if entry["status"] == "kept" and entry["proposal"]]
+    if accepted:
+        refined = sorted({entry["proposal"]["refined"] for entry in accepted if entry["proposal"]["refined"]})
+        lines += [
+            "",
+            f"The masks of {len(accepted)} groups were not drawn but proposed from what changes within the group"
+            + (f", refined by {', '.join(refined)}," if refined else "")
+            + " and accepted by whoever made this dataset: "
+            + ", ".join(f"`{entry['group_id']}`" for entry in accepted)
+            + ".",
+        ]
+    if report["settings"]["registration"]["paper_exact"]:
+        lines += ["", "Registered by the paper's thresholds alone (`--paper-exact`)."]
+    return "\n".join(lines)

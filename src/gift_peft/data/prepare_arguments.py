@@ -1,0 +1,180 @@
+"""The arguments of `gift-peft prepare`. Every threshold has one; a YAML file (`--config`) may state the same names,
+and the command line wins."""
+
+import argparse
+import difflib
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import yaml
+
+from gift_peft.data.capture_group import PrepareSettings
+from gift_peft.data.layout import read_layout
+from gift_peft.data.matching import RegistrationSettings
+from gift_peft.data.quality import QualitySettings
+
+PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
+FLAGS = {
+    "static_rig": "no camera moved in any group: nothing is warped (static_rig: true in group.yaml says it of one)",
+    "propose_masks": "propose masks for groups that lack any, into OUT/masks_proposed; they are not used",
+    "accept_proposed_masks": "use the proposed masks, which the dataset card then says",
+    "paper_exact": "the paper's registration thresholds alone; the report says what the rest would have done",
+}
+EPILOG = """Exit code: 0 if every group is in OUT, 3 if some were rejected (the report says why), 1 if none could
+be made, or RAW or a configuration file is wrong, 2 for a wrong command line. Run again, it does what is left to do."""
+
+
+def run(argv: Sequence[str]) -> int:
+    """`gift-peft prepare`: prepare, say in a few lines what came of it, and return the exit code."""
+    from gift_peft.data.captures import prepare
+
+    args = parse_arguments(argv)
+    report = prepare(
+        args.raw,
+        args.out,
+        args.settings,
+        num_proc=args.num_proc,
+        license=args.license,
+        pretty_name=args.pretty_name,
+    )
+    for entry in report["groups"]:
+        if entry["status"] == "rejected":
+            text = entry["reasons"][0]["text"]
+            print(f"gift-peft: rejected: {entry['split']}/{entry['group_id']}: {text}", file=sys.stderr)
+    for split, found in report["statistics"].items():
+        print(
+            f"{split}: {found['groups']} groups, {found['images']} images ({found['warped_frames']} frames warped, "
+            f"{found['dropped_frames']} dropped), {found['references']} references, "
+            f"{found['rejected_groups']} groups rejected"
+        )
+    print(f"Report: {Path(args.out) / 'report.html'}")
+    kept = sum(found["groups"] for found in report["statistics"].values())
+    if not kept:
+        raise ValueError(f"no group could be prepared; {Path(args.out) / 'report.html'} says why")
+    return 0 if kept == len(report["groups"]) else 3
+
+
+def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
+    """`raw`, `out`, `settings` (a `PrepareSettings`), `num_proc`, `license` and `pretty_name` from the command line.
+
+    A wrong command line ends as argparse does it (exit code 2). Raises ValueError or FileNotFoundError naming the YAML
+    file and its key.
+    """
+    parser = _parser()
+    given = {key: value for key, value in vars(parser.parse_args(argv)).items() if value is not None}
+    config = given.pop("config", None)
+    values = {**(_read_config(Path(config)) if config else {}), **given}
+    parts = {
+        name: kind(**{f.name: values[f.name] for f in fields(kind) if f.name in values})
+        for name, kind in PARTS.items()
+    }
+    if values.get("accept_proposed_masks") or values.get("refine"):
+        values["propose_masks"] = True
+    layout = values.get("layout")
+    settings = PrepareSettings(
+        **parts,
+        **{key: values[key] for key in ("static_rig", "propose_masks", "accept_proposed_masks") if key in values},
+        refine=values.get("refine"),
+        layout=None if layout is None else read_layout(layout),
+    )
+    return argparse.Namespace(
+        raw=values["raw"],
+        out=values["out"],
+        settings=settings,
+        num_proc=values.get("num_proc", 1),
+        license=values.get("license", "unknown"),
+        pretty_name=values.get("pretty_name"),
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="gift-peft prepare",
+        description="From a folder of photos to a checked GIFT-I dataset: register, check, write, report.",
+        epilog=EPILOG,
+        allow_abbrev=False,
+        argument_default=None,
+    )
+    parser.add_argument("raw", metavar="RAW", help="folder of group folders; it is only read")
+    parser.add_argument("out", metavar="OUT", help="prepared folder: new, or made by this command before")
+    _add(parser, "config", metavar="FILE", help="YAML file with values for these arguments; the command line wins")
+    _add(parser, "num_proc", type=_count, metavar="N", help="processes, each with groups of its own (default: 1)")
+    _add(parser, "layout", metavar="FILE", help="YAML file that says where RGB, mask and proxy files lie")
+    _add(parser, "refine", metavar="sam2:MODEL", help="refine the proposals' borders with SAM 2")
+    _add(parser, "license", metavar="ID", help="for the dataset card, for example cc-by-4.0 (default: unknown)")
+    _add(parser, "pretty_name", metavar="NAME", help="for the dataset card (default: the name of RAW)")
+    for name, text in FLAGS.items():
+        _add(parser, name, action=argparse.BooleanOptionalAction, help=text)
+    parser.add_argument("--debug", action="store_true", default=None, help="show the traceback of an error")
+    for part, kind in PARTS.items():
+        group = parser.add_argument_group(f"thresholds of {part}", f"explained in {kind.__module__}.{kind.__name__}")
+        for f in fields(kind):
+            if f.name not in FLAGS:
+                _add(group, f.name, type=_number(type(f.default)), metavar="X", help=f"default: {f.default:g}")
+    return parser
+
+
+def _add(parser, name: str, **options) -> None:
+    """Under both spellings, --num_proc and --num-proc."""
+    spellings = dict.fromkeys((f"--{name.replace('_', '-')}", f"--{name}"))
+    if options.get("action") is argparse.BooleanOptionalAction:
+        spellings = {f"--{name.replace('_', '-')}": None}
+    parser.add_argument(*spellings, dest=name, **options)
+
+
+def _raise(message: str):
+    raise ValueError(message)
+
+
+def _count(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
+    return int(text)
+
+
+def _number(kind: type):
+    def parse(text: str):
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not 0 <= value < math.inf:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a {kind.__name__} of at least 0")
+        return value
+
+    return parse
+
+
+def _read_config(path: Path) -> dict:
+    """The file's values, checked by the same parser as if they stood on the command line."""
+    if not path.is_file():
+        raise FileNotFoundError(f"config: no such file: {path}")
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"config {path}: not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"config {path}: expected lines of the form `key: value`")
+    parser = _parser()
+    parser.error = _raise
+    known = {action.dest for action in parser._actions if action.option_strings} - {"config", "help", "debug"}
+    argv = []
+    for key, value in values.items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1)
+            raise ValueError(f"config {path}: unknown key {key!r}" + (f"; did you mean {near[0]}?" if near else ""))
+        if isinstance(value, list | dict) or (key in FLAGS) != isinstance(value, bool):
+            wanted = "true or false" if key in FLAGS else "one value"
+            raise ValueError(f"config {path}: {key}: {value!r}; expected {wanted}")
+        if key in FLAGS:
+            argv.append(f"--{'' if value else 'no-'}{key.replace('_', '-')}")
+        elif value is not None:
+            argv.append(f"--{key}={value}")
+    try:
+        parsed = parser.parse_args(["RAW", "OUT", *argv])
+    except ValueError as error:
+        raise ValueError(f"config {path}: {error}") from None
+    return {key: value for key, value in vars(parsed).items() if value is not None and key not in ("raw", "out")}

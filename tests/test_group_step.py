@@ -1,18 +1,22 @@
-"""Snapshot and replay against autograd through the whole group, on one process and on two."""
+"""Snapshot and replay against autograd through the whole group, on one process, on two and on three."""
 
 import math
+from contextlib import contextmanager
 
 import pytest
 import torch
-from accelerate import Accelerator, debug_launcher
+from accelerate import Accelerator, DistributedType, debug_launcher
 from accelerate.state import AcceleratorState, GradientState
 from peft import LoraConfig, get_peft_model
-from tiny import tiny_model
+from tiny import tiny_model, tiny_processor, write_raw_tree
 from torch import nn
 
 from gift_peft.adapters import get_gift_model
+from gift_peft.data.gift_i import load_gift_i
+from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import gift_loss
+from gift_peft.training.teacher import make_proxies
 
 SIZE = (28, 28)
 COUNTS, CUTS = (2, 3, 5, 9), (1, 2, 4)
@@ -160,6 +164,39 @@ def test_schedule():
     assert GroupStep(model, retain=3).accumulate(*data).forwards == 7
     assert model.seen == [(2, False), (2, True), (1, True), (2, True)]
     assert model.unused.grad is None
+
+
+def test_larger_snapshot_micro_batches():
+    """Fewer forwards of more images; the last ones are retained and cut as ever."""
+    model, data = toy(torch.float64), group(9)
+    GroupStep(model, retain=0).accumulate(*data)
+    want = gradients(model)
+    for together, retain, seen in (
+        (4, 0, [(4, False), (4, False), (1, False), *[(2, True)] * 4, (1, True)]),
+        (4, 3, [(4, False), (2, False), (2, True), (1, True), *[(2, True)] * 3]),
+        (8, 9, [*[(2, True)] * 4, (1, True)]),
+    ):
+        model.zero_grad()
+        model.seen.clear()
+        step = GroupStep(model, retain=retain, snapshot_micro_batch_size=together)
+        assert step.accumulate(*data).forwards == 18 - retain
+        assert model.seen == seen
+        assert largest_error(gradients(model), want) < 1e-12
+
+
+def test_phases_of_a_step():
+    names = []
+
+    @contextmanager
+    def phase(name):
+        names.append(name)
+        yield
+        names.append("end")
+
+    step = GroupStep(toy(), retain=0)
+    step.phase = phase
+    step.accumulate(*group(3, torch.float32))
+    assert names == ["snapshot", "end", "loss", "end", "replay", "end"]
 
 
 def test_works_under_no_grad_and_leaves_the_mode_alone():
@@ -311,6 +348,9 @@ def test_bad_arguments():
         ({"retain": -1}, "retain must be"),
         ({"retain": "all"}, "retain must be"),
         ({"retain": 1.5}, "retain must be"),
+        ({"snapshot_micro_batch_size": 3, "retain": 0}, "multiple of micro_batch_size 2, got 3"),
+        ({"snapshot_micro_batch_size": 0, "retain": 0}, "multiple of micro_batch_size"),
+        ({"snapshot_micro_batch_size": 4}, "needs a fixed retain"),
     ):
         with pytest.raises(ValueError, match=message):
             GroupStep(toy(), **kwargs)
@@ -322,6 +362,13 @@ def test_fp16_and_ddp_are_refused():
 
     with pytest.raises(ValueError, match="mixed precision fp16 is not supported"):
         GroupStep(toy(), accelerator=Fp16())
+
+    class Sharded:
+        mixed_precision = "no"
+        distributed_type = DistributedType.FSDP
+
+    with pytest.raises(ValueError, match="FSDP is not supported"):
+        GroupStep(toy(), accelerator=Sharded())
     wrapped = nn.parallel.DistributedDataParallel.__new__(nn.parallel.DistributedDataParallel)
     with pytest.raises(ValueError, match="DistributedDataParallel"):
         GroupStep(wrapped)
@@ -410,14 +457,56 @@ def test_two_processes_sum_to_the_gradient(two, model_of, count, cut):
         assert output[:4] == expected[:4] and output.forwards == 2 * count - num_retained(count, cut, retain)
 
 
+def work_of_three(folder, base_dir, tree):
+    """Training, proxies and evaluation by three processes, with fewer micro-batches and groups than processes."""
+    AcceleratorState._reset_state(reset_partial_state=True)
+    GradientState._reset_state()
+    torch.set_num_threads(1)
+    accelerator = Accelerator(cpu=True)
+    assert accelerator.num_processes == 3
+    answers = {(name, "trained"): train(gift_model(d, spread=0), accelerator, d) for name, d in DTYPES.items()}
+    proxies = {"size": (56, 70), "proxies_dir": folder / "proxies"}
+    make_proxies(base_dir, tree, accelerator=accelerator, **proxies)
+    rows = load_gift_i(tree, "train", teacher=base_dir, **proxies)
+    report = evaluate_gift_i(rows, tiny_model(), accelerator=accelerator, processor=tiny_processor(), progress=False)
+    answers["evaluation"] = report.gce, report.rows
+    torch.save(answers, folder / f"{accelerator.process_index}.pt")
+
+
+@pytest.fixture(scope="module")
+def three(base_dir, tmp_path_factory):
+    """(the answers of each process, their folder, the tree they looked at: groups of 2 and of 5 images)."""
+    folder = tmp_path_factory.mktemp("three")
+    tree = write_raw_tree(folder / "raw", train=(2, 5), validation=())
+    list_of_rows = load_gift_i(tree, "train")  # the listing is cached by one process
+    assert len(list_of_rows) == 2
+    debug_launcher(work_of_three, (folder, base_dir, tree), num_processes=3)
+    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(3)], folder, tree
+
+
 @pytest.mark.parametrize(("name", "tolerance"), [("float64", 1e-9), ("float32", 1e-5)])
-def test_two_processes_train_the_same_adapter(two, name, tolerance):
+def test_two_and_three_processes_train_the_same_adapter(two, three, name, tolerance):
     model = gift_model(DTYPES[name], spread=0)
     start = {key: p.detach().clone() for key, p in model.named_parameters() if p.requires_grad}
     want = train(model, None, DTYPES[name])
-    assert largest_error(two[0][name, "trained"], two[1][name, "trained"]) == 0
-    assert largest_error(two[0][name, "trained"], want) < tolerance
+    for processes in (two, three[0]):
+        for answers in processes:
+            assert largest_error(processes[0][name, "trained"], answers[name, "trained"]) == 0
+        assert largest_error(processes[0][name, "trained"], want) < tolerance
     assert largest_error(start, want) > 1e-4  # it did train
+
+
+def test_three_processes_share_proxies_and_evaluation(three, base_dir, tmp_path):
+    processes, folder, tree = three
+    options = {"size": (56, 70), "proxies_dir": tmp_path}
+    make_proxies(base_dir, tree, **options)
+    files = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*.safetensors"))
+    assert len(files) == 2
+    assert all((tmp_path / file).read_bytes() == (folder / "proxies" / file).read_bytes() for file in files)
+    rows = load_gift_i(tree, "train", teacher=base_dir, **options)
+    report = evaluate_gift_i(rows, tiny_model(), processor=tiny_processor(), progress=False)
+    for answers in processes:
+        assert repr(answers["evaluation"]) == repr((report.gce, report.rows))
 
 
 def test_two_processes_add_this_group_only(two):

@@ -76,6 +76,9 @@ class GroupStep:
             raise ValueError(f'retain must be "auto" or a number of images >= 0, got {retain!r}')
         if isinstance(model, nn.parallel.DistributedDataParallel):
             raise ValueError("GroupStep sums gradients itself: pass the model without DistributedDataParallel")
+        kind = str(getattr(accelerator, "distributed_type", "NO")).removeprefix("DistributedType.")
+        if kind != "NO" and not kind.startswith("MULTI_"):  # FSDP, DeepSpeed, Megatron ... own weights and backward
+            raise ValueError(f"GroupStep needs whole weights on every process: {kind} is not supported, use MULTI_GPU")
         if snapshot_micro_batch_size is not None:
             if snapshot_micro_batch_size < 1 or snapshot_micro_batch_size % micro_batch_size:
                 raise ValueError(
@@ -244,6 +247,7 @@ class GroupStep:
             for index in self._mine(batches):
                 prediction = graphs.pop(index) if index in graphs else self._predict(pixel_values[batches[index]])
                 prediction.backward(gradient[batches[index]].to(prediction.dtype))
+                del prediction  # before the next forward, not after
 
         with self.phase("replay"), torch.enable_grad():
             self._recovering(backward, pixel_values, graphs)

@@ -16,14 +16,14 @@ from gift_peft.evaluation.evaluate import run_evaluation
 from gift_peft.evaluation.report import run_report
 from gift_peft.training import parse_arguments, train
 
-RATIOS = ("1:1", "1:1.5", "1:2", "2:1", "1:0")
+RATIOS = [(1.0, 1.0), (1.0, 1.5), (1.0, 2.0), (2.0, 1.0), (1.0, 0.0)]  # (lambda_c, lambda_d)
 OURS = ("lambda_c", "lambda_d", "resume_from_checkpoint", "overwrite_output_dir", "push_to_hub")
 
 
 def main(argv: list[str]) -> int:
     """Exit code: 0, or 128 + the signal that stopped a run."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--ratios", nargs="+", default=list(RATIOS), type=weights, metavar="C:D")
+    parser.add_argument("--ratios", nargs="+", default=RATIOS, type=weights, metavar="C:D")
     own, rest = parser.parse_known_args(argv)
     if {"-h", "--help"} & set(rest):
         print(__doc__)
@@ -34,8 +34,7 @@ def main(argv: list[str]) -> int:
             raise ValueError(f"{word.split('=')[0]}: the ablation sets it itself")
     output = Path(parse_arguments(rest).output_dir)
     folders = []
-    for ratio in dict.fromkeys(own.ratios):
-        weight_c, weight_d = ratio
+    for weight_c, weight_d in dict.fromkeys(own.ratios):
         folder = output / f"{weight_c:g}-{weight_d:g}"
         print(f"== {weight_c:g}:{weight_d:g} in {folder}", flush=True)
         options = [f"--lambda_c={weight_c}", f"--lambda_d={weight_d}", f"--output_dir={folder}"]

@@ -44,12 +44,21 @@ def trained(base_dir, tree, tmp_path_factory):
     return out
 
 
+@pytest.fixture(scope="module")
+def evaluated(trained, base_dir, tree):
+    """The same run with an evaluation."""
+    copy = Path(shutil.copytree(trained, trained.parent / "evaluated"))
+    run_evaluation(base_dir, tree, copy / "adapter", out=copy / "evaluation", progress=False)
+    return copy
+
+
 @pytest.fixture
-def run_folder(trained, tmp_path):
-    return Path(shutil.copytree(trained, tmp_path / "my-run"))
+def run_folder(evaluated, tmp_path):
+    return Path(shutil.copytree(evaluated, tmp_path / "my-run"))
 
 
 def test_one_command_from_a_run_to_everything(run_folder, tree, capsys):
+    shutil.rmtree(run_folder / "evaluation")
     image = tree / "train" / "scene_0" / "0.png"
     with pytest.raises(SystemExit) as exit:
         cli.main(["report", str(run_folder), "--model-card", "--zero-shot", str(image), "--steps", "1", "4"])
@@ -78,7 +87,7 @@ def test_one_command_from_a_run_to_everything(run_folder, tree, capsys):
             assert "Protocol native" in note and "Skipped: 0 of 5 images" in note
     page = (folder / "compare.html").read_text()
     assert page.count("<article>") >= 2 and not re.search(r"(src|href)=\"(?!data:)", page)
-    assert not [path for path in folder.rglob(".*")]
+    assert not list(folder.rglob(".*"))
 
 
 def test_the_card_of_a_run_has_its_evaluation(run_folder, base_dir, tree):
@@ -97,19 +106,17 @@ def test_the_card_of_a_run_has_its_evaluation(run_folder, base_dir, tree):
 
 
 def test_an_evaluation_of_another_adapter_is_not_on_the_card(run_folder, base_dir, tree):
-    run_evaluation(base_dir, tree, run_folder / "adapter", out=run_folder / "whole", progress=False)
     run_evaluation(base_dir, tree, run_folder / "adapter", out=run_folder / "half", adapter_scale=0.5, progress=False)
     run_evaluation(base_dir, tree, run_folder / "checkpoint-1", out=run_folder / "early", progress=False)
     run_report([run_folder], card=run_folder / "card.md", panels=0)
     results = ModelCard.load(run_folder / "card.md").data.eval_results
     assert [result.metric_type for result in results].count("gce") == 1
-    whole = GiftIReport.load(run_folder / "whole")
+    whole = GiftIReport.load(run_folder / "evaluation")
     assert results[0].metric_value == pytest.approx(whole.gce["adapted"], abs=1e-6)
     assert "(adapter scale 0.5) + GIFT" in (run_folder / "report" / "report.md").read_text()
 
 
 def test_what_cannot_be_drawn_is_said_and_the_rest_is_there(run_folder, tmp_path, capsys):
-    run_report([run_folder], panels=0)
     about = json.loads((run_folder / "evaluation" / "metrics.json").read_text())
     about["about"]["base"] = str(tmp_path / "gone")
     (run_folder / "evaluation" / "metrics.json").write_text(json.dumps(about))
@@ -129,8 +136,9 @@ def test_without_matplotlib_pictures_stay_and_the_rest_says_what_to_install(run_
     assert said.count("pip install gift-peft[plots]") == 4  # two PDFs, two figures of curves
 
 
-def test_metrics_alone_still_give_curves(run_folder, capsys):
+def test_metrics_alone_still_give_curves(run_folder):
     shutil.rmtree(run_folder / "adapter")
+    shutil.rmtree(run_folder / "evaluation")
     run_report([run_folder])
     assert (run_folder / "report" / "dynamics.png").exists()
 
@@ -164,7 +172,7 @@ def test_checkpoints_for_the_zero_shot_panel(run_folder):
     run = read_run(run_folder)
     assert list(checkpoint_folders(run, [4])) == [4]
     assert list(checkpoint_folders(run)) == [1, 4]  # those it was told to keep
-    with pytest.raises(FileNotFoundError, match=r"no checkpoint of step 7 \(there are: 1, 3, 4\)"):
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint of step 7 \(there are: 1, 2, 3, 4\)"):
         checkpoint_folders(run, [7])
 
 

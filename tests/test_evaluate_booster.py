@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from accelerate import debug_launcher
 from booster_tree import depth4tom_by_hand, write_predictions, write_root, write_scene
 from PIL import Image
 from tiny import SIZE, tiny_model, tiny_processor
@@ -253,6 +254,26 @@ def test_non_finite_predictions_are_named(tmp_path):
 
     with pytest.raises(ValueError, match=r"scene Scene0: the base prediction of im1\.png \(image 1\) has NaN"):
         evaluate(tmp_path, model=broken, **options)
+
+
+def _evaluate_in_two_processes(root):
+    from accelerate import Accelerator
+    from accelerate.state import AcceleratorState
+
+    AcceleratorState._reset_state(reset_partial_state=True)  # the parent's tests may have made one before the fork
+    accelerator = Accelerator(cpu=True)
+    report = evaluate(root, predictions=root / "pred", kind="inverse_depth", accelerator=accelerator)
+    report.save(root / str(accelerator.process_index))
+
+
+def test_two_processes_give_the_report_of_one(tmp_path):
+    truths = write_root(tmp_path, scenes=3)
+    write_predictions(tmp_path / "pred", truths)
+    debug_launcher(_evaluate_in_two_processes, (tmp_path,), num_processes=2)
+    one, two = (load_report(tmp_path / rank) for rank in "01")
+    alone = evaluate(tmp_path, predictions=tmp_path / "pred", kind="inverse_depth")
+    assert one.to_dict() == two.to_dict() == alone.to_dict()
+    assert one.rows == two.rows and [row["group_id"] for row in one.rows[::2]] == ["Scene0", "Scene1", "Scene2"]
 
 
 # ---- the report ----

@@ -4,6 +4,7 @@ Scene by scene and image by image: a scene of 12 megapixels takes the memory of 
 geometry and differ in light, so Eq. 7 over them (illumination GCE) tells how much the light alone moves a prediction.
 """
 
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -37,6 +38,8 @@ from gift_peft.evaluation.results import (
 )
 from gift_peft.evaluation.scoring import NO_DEPTH, Scorer, native_statistics, resize_prediction
 from gift_peft.losses import GeometryConsistencyError, require_finite
+
+SCENE_PIXELS = 2**20  # of a prediction kept for GCE and spread; a quarter of Booster's size has fewer
 
 # One image's prediction per model.
 ScenePredictor = Callable[[BoosterScene, GroundTruth], Iterable[dict[str, Any]]]
@@ -227,9 +230,14 @@ def _evaluate_scene(scene: BoosterScene, truth: GroundTruth, task: Task, bar: tq
 
 
 def _at_most(prediction: Any, shape: tuple[int, int]) -> torch.Tensor:
-    """A prediction as (h,w) float32, no larger than the evaluation."""
-    if prediction.shape[0] * prediction.shape[1] > shape[0] * shape[1]:
-        prediction = resize_prediction(prediction, shape)
+    """A prediction as (h,w) float32, no larger than the evaluation nor than `SCENE_PIXELS`.
+
+    A scene's predictions are in memory together, so it must not take the size of twelve megapixels times eleven.
+    """
+    factor = min(1.0, math.sqrt(SCENE_PIXELS / (shape[0] * shape[1])))
+    limit = round(shape[0] * factor), round(shape[1] * factor)
+    if prediction.shape[0] * prediction.shape[1] > limit[0] * limit[1]:
+        prediction = resize_prediction(prediction, limit)
     return torch.as_tensor(prediction, dtype=torch.float32)
 
 

@@ -167,7 +167,9 @@ class Scorer:
         nothing |= {region: dict.fromkeys(METRICS, float("nan")) for region in REGIONS}
         if self.pixels["all"] < 2:
             return nothing, self.missing
-        prediction = resize_prediction(prediction, self.reference.shape) * self.scale
+        prediction = resize_prediction(prediction, self.reference.shape)
+        if self.scale != 1:
+            prediction = prediction * self.scale
         try:
             alignment = align(prediction, self.reference, self.fit, self.protocol, self.kind)
         except DegenerateFitError:

@@ -367,7 +367,7 @@ def test_damaged_and_nan_proxies(raw_tree, base_dir):
     ):
         with pytest.raises(ValueError) as excinfo:
             use()
-        one_line(excinfo, f"damaged proxy {path}", "--overwrite")
+        one_line(excinfo, f"damaged proxy {path}", f"`gift-peft proxies --base {base_dir} --dataset", "--overwrite`")
 
 
 def test_nan_predictions_name_group_and_image(raw_tree, base_dir, tmp_path):

@@ -297,6 +297,7 @@ def test_a_dataset_without_train_groups(base_dir, tmp_path):
     write_group(tmp_path / "raw/validation/scene", 2, 0, reference=True)
     with pytest.raises(ValueError, match=r"dataset_name: .*no train split"):
         train(arguments(base_dir, tmp_path / "raw", tmp_path / "out"))
+    assert not (tmp_path / "raw/proxies").exists()  # said before anything is predicted
     assert not list((tmp_path / "out").iterdir())
 
 

@@ -123,14 +123,17 @@ def row_digests(row: dict) -> dict:
     }
 
 
-def read_header(path: Path) -> dict:
-    """The header of a proxy file, empty if it is not one of ours; ValueError if the file is damaged."""
+def read_header(path: Path, command: str = "gift-peft proxies") -> dict:
+    """The header of a proxy file, empty if it is not one of ours; ValueError if the file is damaged.
+
+    `command` makes these proxies, for the message.
+    """
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             return json.loads((file.metadata() or {}).get(METADATA, "{}"))
     except safetensors.SafetensorError as error:
         raise ValueError(
-            f"damaged proxy {path} ({str(error).splitlines()[0]}); make it again with --overwrite"
+            f"damaged proxy {path} ({str(error).splitlines()[0]}); make it again with `{command} --overwrite`"
         ) from None
 
 
@@ -177,7 +180,7 @@ class ProxyStore:
         path = Path(self.folder) / f"{row['group_id']}.safetensors"
         if not path.exists():
             raise FileNotFoundError(f"missing proxy {path}; make it with `{self.command}`")
-        header = read_header(path)
+        header = read_header(path, self.command)
         tensors = safetensors.torch.load_file(path)
         if "proxies" not in tensors:
             raise ValueError(

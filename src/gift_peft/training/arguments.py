@@ -196,6 +196,7 @@ def parse_arguments(argv: list[str]) -> GiftTrainingArguments:
 
     config = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     config.add_argument("--config", type=Path)
+    config.error = _raise
     path = config.parse_known_args(argv)[0].config
     from_file = [] if path is None else _yaml_to_argv(path)
     for word in argv:

@@ -158,6 +158,9 @@ class Run:
     def _data(self) -> tuple[PreparedGroups, PreparedGroups | None]:
         """Train and, where there is one, validation groups with their proxies, which are made if missing."""
         args = self.args
+        splits = gift_i_splits(args.dataset_name)
+        if "train" not in splits:
+            raise ValueError(f"dataset_name: {args.dataset_name} has no train split")
         places = {"proxies_dir": args.proxies_dir, "revision": args.model_revision, "size": self.size}
         try:
             make_proxies(args.model_name_or_path, args.dataset_name, accelerator=self.accelerator, **places)
@@ -166,9 +169,6 @@ class Run:
             options = (size, args.proxies_dir, args.model_revision)
             command = proxies_command(args.model_name_or_path, args.dataset_name, *options)
             raise PermissionError(f"proxies are missing and {error.filename} cannot be written: `{command}`") from None
-        splits = gift_i_splits(args.dataset_name)
-        if "train" not in splits:
-            raise ValueError(f"dataset_name: {args.dataset_name} has no train split")
         cache_dir = Path(args.group_cache_dir) if args.group_cache_dir else default_cache_dir()
         groups = {}
         for split in ("train", "validation"):

@@ -39,8 +39,9 @@ def load_teacher(base: str | Path, revision: str | None = None) -> tuple[torch.n
     from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
     try:
-        model = AutoModelForDepthEstimation.from_pretrained(base, revision=revision, dtype=torch.float32)
-        return model.eval(), AutoImageProcessor.from_pretrained(base, revision=revision)
+        options = {"revision": revision, "trust_remote_code": False}  # no question on the terminal, no foreign code
+        model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, **options)
+        return model.eval(), AutoImageProcessor.from_pretrained(base, **options)
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:  # weights of another shape, a cut-off file
         raise ValueError(f"base model {base}: {str(error).strip().splitlines()[0]}") from error
 
@@ -113,7 +114,7 @@ def _is_current(path: Path, expected: dict, names: Sequence[str], command: str) 
     """Whether a group's proxies exist and hold; ValueError if they exist and do not."""
     if not path.exists():
         return False
-    reason = difference(read_header(path), expected, names)
+    reason = difference(read_header(path, command), expected, names)
     if reason:
         raise ValueError(f"stale proxy {path}: {reason}; make it again with `{command} --overwrite`")
     return True

@@ -15,13 +15,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from peft import PeftModel
+from peft import LoraConfig, PeftConfig, PeftModel
 from peft.tuners.lora import LoraLayer
 
 from gift_peft.adapter_scale import active_lora, active_saved_modules
 
 ADAPTER_CONFIG = "adapter_config.json"
-ADAPTER_FILES = {ADAPTER_CONFIG, "adapter_model.safetensors", "preprocessor_config.json", "gift.json", "README.md"}
+ADAPTER_WEIGHTS = "adapter_model.safetensors"
+GIFT = "gift.json"
+ADAPTER_FILES = {ADAPTER_CONFIG, ADAPTER_WEIGHTS, "preprocessor_config.json", GIFT, "README.md"}
+MAX_RANK = 4096  # above it an adapter is larger than any layer here, and asks for memory before its weights are read
 
 
 def save_adapter(
@@ -67,7 +70,7 @@ def save_adapter(
         if processor is not None:
             # Not save_pretrained: it would put the code of VGGT's and Metric3D's processors beside the adapter.
             _at_size(processor, size).to_json_file(temporary / "preprocessor_config.json")
-        _write_json(temporary / "gift.json", _gift_json(gift, size))
+        _write_json(temporary / GIFT, _gift_json(gift, size))
         # Last: PEFT writes a README of its own, which names a local base path.
         (temporary / "README.md").write_text(card or _minimal_card(hub_base), encoding="utf-8")
         _replace_folder(temporary, folder)
@@ -154,3 +157,89 @@ def _nan_to_null(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_nan_to_null(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# ---- reading ----
+
+
+def read_adapter_config(adapter: str | Path) -> LoraConfig:
+    """The PEFT configuration of a folder or hub id, checked before anything is built from it.
+
+    Raises FileNotFoundError if there is none or, in a folder, no `adapter_model.safetensors` beside it (pickles are
+    not read), ValueError naming file and field for what is no LoRA configuration.
+    """
+    if Path(adapter).is_dir():
+        for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS):
+            if not (Path(adapter) / name).is_file():
+                raise FileNotFoundError(f"adapter {adapter}: the folder has no {name}")
+        _read_object(adapter, ADAPTER_CONFIG)
+    where = f"adapter {adapter}: damaged {ADAPTER_CONFIG}"
+    try:
+        config = PeftConfig.from_pretrained(adapter)
+    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise ValueError(f"{where} ({_first_line(error)})") from None
+    except (OSError, ValueError) as error:
+        if Path(adapter).is_dir():
+            raise ValueError(f"{where} ({_first_line(error)})") from None
+        reason = _first_line(error)
+        raise FileNotFoundError(f"adapter {adapter}: no such folder, and not on the hub ({reason})") from None
+    if not isinstance(config, LoraConfig):
+        raise ValueError(f"adapter {adapter}: its peft_type is {config.peft_type}; GIFT adapters are LORA")
+    _check_fields(config, where)
+    return config
+
+
+def read_gift(adapter: str | Path) -> dict[str, Any]:
+    """An adapter folder's gift.json; empty without one (an adapter that PEFT alone saved, or one on the hub)."""
+    return _read_object(adapter, GIFT) if (Path(adapter) / GIFT).is_file() else {}
+
+
+def _read_object(adapter: str | Path, name: str) -> dict[str, Any]:
+    """The object in a JSON file of an adapter; ValueError naming both for anything else."""
+    try:
+        content = json.loads((Path(adapter) / name).read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        raise ValueError(f"adapter {adapter}: damaged {name} ({_first_line(error)})") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"adapter {adapter}: damaged {name} (it holds a {type(content).__name__}, not an object)")
+    return content
+
+
+def _check_fields(config: LoraConfig, where: str) -> None:
+    """Types and ranges, which a dataclass of PEFT takes as they come."""
+
+    def is_rank(value: Any) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and 0 < value <= MAX_RANK
+
+    def is_number(value: Any) -> bool:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+    def is_text(value: Any) -> bool:
+        return value is None or isinstance(value, str)
+
+    def is_names(value: Any) -> bool:
+        return value is None or (
+            isinstance(value, (list, set, tuple)) and all(isinstance(name, str) for name in value)
+        )
+
+    def is_pattern(value: Any, check: Any) -> bool:
+        return isinstance(value or {}, dict) and all(map(check, (value or {}).values()))
+
+    checks = {
+        "r": is_rank(config.r),
+        "lora_alpha": is_number(config.lora_alpha),
+        "rank_pattern": is_pattern(config.rank_pattern, is_rank),
+        "alpha_pattern": is_pattern(config.alpha_pattern, is_number),
+        "target_modules": is_text(config.target_modules) or is_names(config.target_modules),
+        "modules_to_save": is_names(config.modules_to_save),
+        "base_model_name_or_path": is_text(config.base_model_name_or_path),
+        "revision": is_text(config.revision),
+        "megatron_config": config.megatron_config is None,  # would import a module that the file names
+    }
+    for name, holds in checks.items():
+        if not holds:
+            raise ValueError(f"{where} ({name} cannot be {str(getattr(config, name))[:80]!r})")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

@@ -4,7 +4,7 @@ Pictures are resized as in training and the prediction is brought back to each p
 interpolation of transformers' `post_process_depth_estimation`. Values stay in the network's native units.
 """
 
-import json
+import re
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
@@ -75,8 +75,9 @@ def load_model(
         size = resolve_size(size, None, processor, model.config)
         return LoadedModel(model.to(device).eval(), processor, size, model.config.prediction_kind)
     try:
-        model = AutoModelForDepthEstimation.from_pretrained(base, revision=revision, dtype=torch.float32)
-        processor = AutoImageProcessor.from_pretrained(base, revision=revision, backend="pil")
+        options = {"revision": revision, "trust_remote_code": False}  # no question on the terminal, no foreign code
+        model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, **options)
+        processor = AutoImageProcessor.from_pretrained(base, backend="pil", **options)
     except OSError as error:
         raise FileNotFoundError(f"base model {base}: {_first_line(error)}") from None
     except (ValueError, RuntimeError, SafetensorError) as error:  # weights of another shape, a cut-off file
@@ -125,7 +126,11 @@ def prediction_kind(model: Any) -> str:
         raise ValueError('say what the model predicts: kind="depth" or kind="inverse_depth"')
     if getattr(config, "prediction_kind", None):  # a model of another package says it itself
         return config.prediction_kind
-    return get_recipe(model).kind_for(config)
+    try:
+        return get_recipe(model).kind_for(config)
+    except ValueError:
+        name = getattr(config, "model_type", type(model).__name__)
+        raise ValueError(f'no recipe says what {name} predicts: kind="depth" or kind="inverse_depth"') from None
 
 
 def predict_images(
@@ -228,17 +233,13 @@ def _unique_names(files: Sequence[Path], beside: bool) -> list[str]:
 
 def _attach(model, processor, base, adapter, revision):
     """The PeftModel and its image processor; one clear error if the adapter belongs to another base."""
-    from peft import PeftConfig, PeftModel
+    from peft import PeftModel
+    from safetensors import SafetensorError
     from transformers import AutoImageProcessor
 
-    if Path(adapter).is_dir() and not (Path(adapter) / "adapter_config.json").is_file():
-        raise FileNotFoundError(f"adapter {adapter}: the folder has no adapter_config.json")
-    try:
-        made_for = PeftConfig.from_pretrained(adapter).base_model_name_or_path
-    except (OSError, ValueError) as error:
-        raise FileNotFoundError(
-            f"adapter {adapter}: no such folder, and not on the hub ({_first_line(error)})"
-        ) from None
+    from gift_peft.adapter_folder import ADAPTER_WEIGHTS, read_adapter_config
+
+    made_for = read_adapter_config(adapter).base_model_name_or_path
     _check_base(base, revision, adapter, made_for)
     mismatch = f"adapter {adapter} does not fit base {base}: it was trained on {made_for}"
     with warnings.catch_warnings():
@@ -247,10 +248,12 @@ def _attach(model, processor, base, adapter, revision):
         warnings.filterwarnings("error", "Found missing adapter keys", UserWarning)
         try:
             model = PeftModel.from_pretrained(model, adapter)
-        except (RuntimeError, ValueError, KeyError, UserWarning) as error:
+        except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, UserWarning, re.error) as error:
             raise ValueError(f"{mismatch} ({_first_line(error)})") from None
+        except (OSError, SafetensorError) as error:
+            raise ValueError(f"adapter {adapter}: damaged {ADAPTER_WEIGHTS} ({_first_line(error)})") from None
     with suppress(OSError, ValueError):  # an adapter that PEFT alone saved: the base's processor serves
-        processor = AutoImageProcessor.from_pretrained(adapter, backend="pil")
+        processor = AutoImageProcessor.from_pretrained(adapter, backend="pil", trust_remote_code=False)
     return model, processor
 
 
@@ -261,7 +264,11 @@ def _check_base(base, revision, adapter, made_for: str | None) -> None:
     hub ids by name. A folder here for a hub id there, or the
     other way round, may be a copy: then shapes alone decide.
     """
-    trained, present = _read_gift(adapter).get("base_revision") or "", teacher_revision(base, revision)
+    from gift_peft.adapter_folder import read_gift
+
+    trained, present = read_gift(adapter).get("base_revision") or "", teacher_revision(base, revision)
+    if not isinstance(trained, str):
+        raise ValueError(f"adapter {adapter}: damaged gift.json (base_revision is a {type(trained).__name__})")
     if not trained and made_for and (Path(made_for) / "config.json").is_file():
         trained = teacher_revision(made_for)
     was_folder, is_folder = (pin.startswith("sha256:") for pin in (trained, present))
@@ -269,12 +276,6 @@ def _check_base(base, revision, adapter, made_for: str | None) -> None:
         raise ValueError(f"adapter {adapter} was trained on {made_for}, whose files are not those of base {base}")
     if made_for not in (None, str(base)) and not was_folder and not is_folder and not Path(made_for).exists():
         raise ValueError(f"adapter {adapter} was trained on {made_for}, not on base {base}")
-
-
-def _read_gift(adapter) -> dict:
-    """The adapter's gift.json; empty without one (an adapter that PEFT alone saved)."""
-    path = Path(adapter) / "gift.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def _first_line(error: Exception) -> str:

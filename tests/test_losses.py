@@ -8,7 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
+from gift_peft import losses
 from gift_peft.losses import (
     GeometryConsistencyError,
     geometry_consistency_error,
@@ -16,6 +19,7 @@ from gift_peft.losses import (
     group_consistency_loss,
     masked_l1,
     prediction_spread,
+    require_finite,
     self_distillation_loss,
 )
 
@@ -187,6 +191,60 @@ def test_pair_sums_keep_no_graph_per_pair():
     with torch.autograd.graph.saved_tensors_hooks(lambda t: saved.append(t.numel()) or t, lambda t: t):
         group_consistency_loss(depth.requires_grad_(), mask)
     assert sum(saved) < 4 * depth.numel()
+
+
+@pytest.mark.parametrize("same_masks", [True, False])
+def test_blocks_of_pixels_add_up(same_masks, monkeypatch):
+    depth, _, mask, _ = random_group(6, 1, 0.6, size=(9, 11))
+    if same_masks:
+        mask = mask[:1].expand_as(mask)
+    expected, _ = consistency(depth.requires_grad_(), mask)
+    (expected_gradient,) = torch.autograd.grad(expected, depth)
+    for elements in (1, 6, 45, 10_000):
+        monkeypatch.setattr(losses, "BLOCK_ELEMENTS", elements)
+        value = group_consistency_loss(depth, mask)
+        torch.testing.assert_close(value, expected, rtol=1e-12, atol=0)
+        torch.testing.assert_close(torch.autograd.grad(value, depth)[0], expected_gradient, rtol=1e-12, atol=1e-15)
+
+
+class Allocations(TorchDispatchMode):
+    """`.sizes`: bytes of every tensor that an operation makes."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        result = function(*args, **(kwargs or {}))
+        given = {t.untyped_storage().data_ptr() for t in tree_leaves(args) if isinstance(t, torch.Tensor)}
+        for tensor in tree_leaves(result):
+            if isinstance(tensor, torch.Tensor) and tensor.untyped_storage().data_ptr() not in given:
+                self.sizes.append(tensor.untyped_storage().nbytes())
+        return result
+
+
+def test_temporary_memory_is_bounded_at_55_images(monkeypatch):
+    """Nothing larger than an image or a block, besides the gradients of the two terms, their scaled one and sum."""
+    depth, target, mask, _ = random_group(55, 0, 0.7, torch.float32, size=(40, 50))
+    monkeypatch.setattr(losses, "BLOCK_ELEMENTS", 2000)
+    with Allocations() as seen:
+        loss = gift_loss(depth.requires_grad_(), target, mask)
+        torch.autograd.grad(loss.total, depth)
+    whole, image = 55 * 2000 * 4, 2000 * 8
+    weights = 55 * 55 * 8
+    large = [size for size in seen.sizes if size > max(image, weights)]
+    assert sum(size == whole for size in large) <= 4
+    assert all(size == whole or size <= whole // 4 for size in large)  # those of bool: finite, the other region
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_the_first_image_with_a_bad_value_is_named(dtype, bad):
+    values = torch.randn(4, 3, 2, 5).to(dtype)
+    require_finite(values, "x")
+    values[2, 1, 1, 4] = values[3, 0, 0, 0] = bad
+    with pytest.raises(ValueError, match=r"x of c \(image 2\) has NaN"):
+        require_finite(values, "x", ["a", "b", "c", "d"])
 
 
 def test_huge_differences_outside_the_mask_do_no_harm():

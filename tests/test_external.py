@@ -9,6 +9,7 @@ import torch
 from booster_tree import write_root
 from PIL import Image
 from torch import nn
+from transformers import DPTConfig, DPTForDepthEstimation, DPTImageProcessorPil
 
 from gift_peft import evaluate_booster
 from gift_peft.data.preprocess import to_pixel_values
@@ -139,6 +140,26 @@ def test_what_is_missing_or_wrong_is_one_line(packages, monkeypatch):
         monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
         with pytest.raises(ValueError, match=rf"^base {name}:known: .*pip install"):
             load_model(f"{name}:known")
+
+
+# ---- architectures of transformers without a recipe ----
+
+
+def test_any_depth_model_of_transformers_is_a_base(tmp_path):
+    base = tmp_path / "dpt"
+    config = DPTConfig(
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, intermediate_size=32, image_size=64, patch_size=16,
+        backbone_out_indices=[0, 1, 2, 3], neck_hidden_sizes=[8, 8, 8, 8], fusion_hidden_size=8, is_hybrid=False,
+    )  # fmt: skip
+    torch.manual_seed(0)
+    DPTForDepthEstimation(config).save_pretrained(base)
+    DPTImageProcessorPil(size={"height": 64, "width": 96}).save_pretrained(base)
+    write_root(tmp_path)
+    options = {"out": tmp_path / "out", "progress": False, "size": "64x64"}
+    with pytest.raises(ValueError, match='no recipe says what dpt predicts: kind="depth"'):
+        run_booster(tmp_path, base, **options)
+    report = run_booster(tmp_path, base, kind="inverse_depth", **options)
+    assert report.counts["scored"] == 4 and report.about["kind"] == "inverse_depth"
 
 
 # ---- the packages themselves ----

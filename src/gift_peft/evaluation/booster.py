@@ -117,7 +117,7 @@ def evaluate_booster(
         stored = PredictionFolder(predictions, prediction_scale)
         stored.check(booster.scenes, needs_scale=rules.dof in ("none", "shift"))
         predict, prediction_scale = _from_files(stored), 1.0
-    task = Task(predict, models, rules, kind, prediction_scale or to_millimetres(model, rules))
+    task = BoosterTask(predict, models, rules, kind, prediction_scale or to_millimetres(model, rules))
 
     rank, world = (accelerator.process_index, accelerator.num_processes) if accelerator else (0, 1)
     results = []
@@ -153,7 +153,7 @@ def evaluate_booster(
 
 
 @dataclass
-class Task:
+class BoosterTask:
     """The choices of one evaluation, the same for every scene."""
 
     predict: ScenePredictor
@@ -205,7 +205,7 @@ def _from_files(stored: PredictionFolder) -> ScenePredictor:
     return predict
 
 
-def _evaluate_scene(scene: BoosterScene, truth: GroundTruth, task: Task, bar: tqdm) -> tuple[dict, list[dict]]:
+def _evaluate_scene(scene: BoosterScene, truth: GroundTruth, task: BoosterTask, bar: tqdm) -> tuple[dict, list[dict]]:
     """The scene's illumination GCE and its rows."""
     everywhere = np.ones(truth.depth.shape, bool)
     score = Scorer(truth.depth, truth.tom, everywhere, task.protocol, task.kind, task.prediction_scale, NO_DEPTH)
@@ -257,7 +257,7 @@ def _illumination_gce(name: str, depths: list[torch.Tensor], truth: GroundTruth)
     }
 
 
-def _report(groups: list[dict], rows: list[dict], task: Task, about: dict) -> BoosterReport:
+def _report(groups: list[dict], rows: list[dict], task: BoosterTask, about: dict) -> BoosterReport:
     subject = "adapted" if "adapted" in task.models else "base"
     average = task.protocol.aggregation
     per_scene = {}

@@ -163,7 +163,8 @@ _PRESETS = (
         loss="l1_rel",
         inverse_loss="l2",
         floor="ref_max",
-        source="MoGe, moge/test/metrics.py: depth_affine_invariant, disparity_affine_invariant",
+        source="MoGe, moge/test/metrics.py: depth_affine_invariant, disparity_affine_invariant (delta1 there counts "
+        "negative depth as right, here it never does)",
     ),
     Protocol(
         "metric",

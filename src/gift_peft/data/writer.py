@@ -4,6 +4,7 @@ One `metadata.parquet` per split, both with the same explicit schema (ImageFolde
 a readable copy `groups.jsonl`, and a dataset card whose YAML names the files of each split.
 """
 
+import hashlib
 import json
 import os
 import re
@@ -43,6 +44,7 @@ tags:
 - gift-peft
 configs:
 - config_name: default
+  description: content {content}
   data_files:
 {data_files}
 ---
@@ -119,8 +121,11 @@ def write_card(
     lines = [json.dumps({"split": split, **row}) + "\n" for split in SPLITS for row in rows[split].values()]
     if not lines:
         raise ValueError(f"no groups to write to {folder}")
+    # `datasets` caches what it reads under the folder's last name and what the card says of its files, nothing else:
+    # two folders of one name would be taken for each other.
+    content = hashlib.blake2b("\n".join([str(folder.resolve()), *lines]).encode(), digest_size=8).hexdigest()
     write_whole(folder / "groups.jsonl", "".join(lines))
-    write_whole(folder / "README.md", _card(rows, license, pretty_name, description))
+    write_whole(folder / "README.md", _card(rows, license, pretty_name, description, content))
 
 
 def _read_rows(path: Path) -> dict[str, dict]:
@@ -232,7 +237,7 @@ def _write_metadata(path: Path, rows: Iterable[dict]) -> None:
     write_whole(path, sink.getvalue().to_pybytes())
 
 
-def _card(rows: dict[str, dict], license: str, pretty_name: str, description: str) -> str:
+def _card(rows: dict[str, dict], license: str, pretty_name: str, description: str, content: str) -> str:
     present = [split for split in SPLITS if rows[split]]
     counts = [f"{split}: {len(rows[split])} groups, {_count_images(rows[split])} images" for split in present]
     return CARD.format(
@@ -240,6 +245,7 @@ def _card(rows: dict[str, dict], license: str, pretty_name: str, description: st
         pretty_name=json.dumps(pretty_name),
         title=pretty_name,
         description=description,
+        content=content,
         counts="; ".join(counts) + ".",
         data_files="\n".join(f"  - split: {split}\n    path: {split}/**" for split in present),
     )

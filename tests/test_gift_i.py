@@ -83,6 +83,15 @@ def test_plain_load_dataset_reads_the_prepared_folder(prepared):
     assert schemas[0] == schemas[1] == SCHEMA
 
 
+@pytest.mark.parametrize("name", ["data [v2]", "what?", "50 % *", "Küche (alt)"])
+def test_a_folders_name_is_no_pattern(name, prepared, tmp_path):
+    decoy = shutil.copytree(prepared, tmp_path / "whats" / "gift-i")  # what `what?` would match as well
+    folder = shutil.copytree(decoy, tmp_path / name / "gift-i")
+    rows = load_gift_i(folder, "train")
+    assert rows["group_id"] == load_gift_i(prepared, "train")["group_id"]
+    assert [image.size for image in rows[0]["images"]] == [(80, 60)] * 2
+
+
 def test_prepared_rows(prepared, raw_tree):
     train, validation = load_gift_i(prepared, "train"), load_gift_i(prepared, "validation")
     assert train.features == validation.features == FEATURES and len(train) == 2
@@ -335,9 +344,9 @@ def test_groups_with_and_without_a_reference_share_a_split(tmp_path):
     for folder in (tmp_path / "raw", write_gift_i(groups, tmp_path / "gift-i", license="cc0-1.0")):
         rows = load_gift_i(folder, "validation")
         assert [row["reference"] is None for row in rows] == [False, True, False]
-    datasets.load_dataset(str(folder), split="validation").to_parquet(
-        tmp_path / "parquet/validation-00000-of-00001.parquet"
-    )
+    rows = datasets.load_dataset(str(folder), split="validation")
+    shard = tmp_path / "parquet/validation-00000-of-00001.parquet"
+    rows.with_format("arrow").map(embed_table_storage, batched=True).with_format(None).to_parquet(shard)
     rows = load_gift_i(tmp_path / "parquet", "validation")
     assert [row["reference"] is None for row in rows] == [False, True, False]
 

@@ -4,6 +4,7 @@
 `import gift_peft` also `datasets.load_dataset("gift_i", data_dir=RAW)` works (paper section 5, the GIFT-I dataset).
 """
 
+import glob
 import hashlib
 import inspect
 import os
@@ -21,6 +22,7 @@ import pyarrow.compute as pc
 from datasets import ClassLabel, Features, List, Value
 from datasets import Image as ImageFeature
 from datasets.builder import Key
+from huggingface_hub.constants import HF_HUB_CACHE
 
 from gift_peft.data.preprocess import SURFACES, image_digest, to_mask
 from gift_peft.data.proxies import FORMAT, ProxyStore, default_proxies_dir, teacher_id, teacher_revision
@@ -212,11 +214,10 @@ def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.D
             return _load_from_hub(str(path), split, revision)
         if prepared := _prepared_splits(folder):
             # Named here, not left to the card: without one, `datasets` guesses splits from words in path names.
-            files = {name: f"{name}/**" for name in prepared}
+            # Escaped, because they are patterns, and a folder may be called "data [v2]".
+            files = {name: f"{glob.escape(str(folder.absolute()))}/{name}/**" for name in prepared}
             _check_split(split, prepared, path)
-            return datasets.load_dataset(
-                "imagefolder", data_dir=str(folder), data_files=files, split=split, features=FEATURES
-            )
+            return datasets.load_dataset("imagefolder", data_files=files, split=split, features=FEATURES)
         if _holds_parquet(folder):
             return datasets.load_dataset(str(folder), split=split, features=FEATURES)
         _check_split(split, list_groups(folder), path)
@@ -251,7 +252,8 @@ def _check_rows(dataset: datasets.Dataset, split: str, path) -> datasets.Dataset
         if count > 1:
             raise ValueError(f"dataset {path}: {count} groups are called {group_id!r} in split {split}")
     tables = dataset.with_format("arrow")
-    keep = [_check_row(tables[index], split) for index in range(len(dataset))]
+    roots = _picture_roots(path)
+    keep = [_check_row(tables[index], split, roots) for index in range(len(dataset))]
     if all(order == list(range(count)) for order, count in keep):
         return dataset
     stored = dataset.cast(_undecoded(dataset.features))
@@ -263,7 +265,7 @@ def _check_rows(dataset: datasets.Dataset, split: str, path) -> datasets.Dataset
     ).cast(dataset.features)
 
 
-def _check_row(table: pa.Table, split: str) -> tuple[list[int], int]:
+def _check_row(table: pa.Table, split: str, roots: list[str]) -> tuple[list[int], int]:
     """Of one row: the images to keep, in natural order, and how many there are."""
     group_id, names = table["group_id"][0].as_py(), table["image_names"][0].as_py()
     for column in IMAGE_COLUMNS:
@@ -271,8 +273,8 @@ def _check_row(table: pa.Table, split: str) -> tuple[list[int], int]:
         count = 0 if files is None else len(files)
         if count != len(names) and (count or column in ("images", "masks")):
             raise ValueError(f"group {group_id}: {len(names)} image names, but a list of {count} {column}")
-        _check_present(files, f"group {group_id}: missing {column.removesuffix('s')}")
-    _check_present(table["reference"].combine_chunks(), f"group {group_id}: missing reference")
+        _check_present(files, f"group {group_id}: missing {column.removesuffix('s')}", roots)
+    _check_present(table["reference"].combine_chunks(), f"group {group_id}: missing reference", roots)
     contents = _contents(table["images"][0].values)
     order = sorted(range(len(names)), key=lambda index: natural_key(names[index]))
     first = {}
@@ -282,11 +284,34 @@ def _check_row(table: pa.Table, split: str) -> tuple[list[int], int]:
     return list(first.values()), len(names)
 
 
-def _check_present(files: pa.StructArray | None, missing: str) -> None:
+def _check_present(files: pa.StructArray | None, missing: str, roots: list[str]) -> None:
     files = None if files is None else files.drop_null()  # a null's fields may hold anything, an empty path for one
     for file in [] if files is None else files.field("path").filter(files.field("bytes").is_null()).to_pylist():
-        if file is not None and "://" not in file and not os.path.exists(file):
+        if file is None:
+            continue
+        if not _is_inside(file, roots):
+            hint = "" if roots else "; in a parquet release the pictures are embedded (`gift-peft export`)"
+            raise ValueError(f"{missing.replace(': missing ', ', ')}: {file} is a path outside of the dataset{hint}")
+        if "://" not in file and not os.path.exists(file):
             raise FileNotFoundError(f"{missing} {file}")
+
+
+def _picture_roots(path: str | Path) -> list[str]:
+    """Where pictures may lie that a row names by path: whoever wrote the row shall not choose any file of ours."""
+    folder = Path(path)
+    if not folder.is_dir():
+        caches = (datasets.config.HF_DATASETS_CACHE, datasets.config.DOWNLOADED_DATASETS_PATH, HF_HUB_CACHE)
+        return ["hf://", *(os.path.abspath(cache) for cache in caches)]
+    if not _prepared_splits(folder) and _holds_parquet(folder):
+        return []
+    return [os.path.abspath(folder)]
+
+
+def _is_inside(file: str, roots: list[str]) -> bool:
+    place = file.rsplit("::", 1)[-1]  # of an archive's member, the archive
+    if "://" in place:
+        return "hf://" in roots and place.startswith("hf://")
+    return any(os.path.abspath(place).startswith(os.path.join(root, "")) for root in roots)
 
 
 def _contents(images: pa.StructArray) -> list:

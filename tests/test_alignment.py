@@ -31,17 +31,39 @@ def lstsq(prediction, target):
 seeds = st.integers(0, 2**32 - 1)
 
 
-@settings(max_examples=60, deadline=None)
-@given(seeds, st.floats(1e-3, 1e3), st.floats(-1e3, 1e3), st.sampled_from([1, -1]))
-def test_recovers_scale_and_shift(seed, scale, shift, sign):
+@settings(max_examples=120, deadline=None)
+@given(
+    seeds,
+    st.floats(1e-3, 1e3),
+    st.floats(-1e3, 1e3),
+    st.sampled_from([1, -1]),
+    st.sampled_from([name for name, rules in PROTOCOLS.items() if rules.dof == "scale_shift"]),
+    st.sampled_from([np.asarray, torch.from_numpy]),
+)
+def test_recovers_scale_and_shift(seed, scale, shift, sign, name, convert):
     truth = scene(seed)
-    scale *= sign
-    prediction = (truth - shift) / scale
-    found = align(prediction, truth, ALL)
+    inverse = PROTOCOLS[name].space == "inverse"
+    unit = 1e-6 if inverse else 1  # of 1/mm, beside mm
+    scale, shift = scale * sign * unit, shift * unit
+    prediction = ((1 / truth if inverse else truth) - shift) / scale
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a negative scale is told
+        found = align(*map(convert, (prediction, truth, ALL)), name, "inverse_depth" if inverse else "depth")
     assert found.scale == pytest.approx(scale, rel=1e-9)
-    assert found.shift == pytest.approx(shift, rel=1e-9, abs=1e-9 * 6000)
-    np.testing.assert_allclose(found.aligned, truth, rtol=1e-9)
+    assert found.shift == pytest.approx(shift, rel=1e-9, abs=1e-9 * 6000 * unit)
+    np.testing.assert_allclose(np.asarray(found.aligned), truth, rtol=1e-9)
     assert found.num_clipped == found.num_nonpositive == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.floats(1e-3, 1e3), st.floats(-1e-2, 1e-2), st.sampled_from([1, -1]))
+def test_recovers_scale_and_shift_of_disparity(seed, scale, shift, sign):
+    truth, scale = scene(seed), scale * sign
+    for name in ("gift", "depth4tom", "moge-affine"):
+        found = align((1 / truth - shift) / scale, truth, ALL, name, "inverse_depth")
+        assert found.scale == pytest.approx(scale, rel=1e-9)
+        assert found.shift == pytest.approx(shift, rel=1e-9, abs=1e-12)
+        np.testing.assert_allclose(found.aligned, truth, rtol=1e-9)
 
 
 @settings(max_examples=40, deadline=None)

@@ -173,7 +173,7 @@ def _group(index: int, group: dict, out: Path, raw: Path, bar: tqdm) -> str:
     for frame in frames:
         parts.append(_frame(frame, group, target_image, out, raw))
         bar.update()
-    return "\n".join([*parts, "</div>", _registrations(frames), "</section>"])
+    return "\n".join([*parts, "</div>", _figures(frames), "</section>"])
 
 
 def _frame(frame: dict, group: dict, target: Image.Image | None, out: Path, raw: Path) -> str:
@@ -195,35 +195,37 @@ def _frame(frame: dict, group: dict, target: Image.Image | None, out: Path, raw:
         ]
     else:
         shots = [_shot(image, frame["role"] if frame["role"] != "observation" else "", blink, outlines)]
-    status = "registered to" if is_target and group["status"] == "kept" else frame["status"]
+    status, mood = frame["status"], frame["status"]
+    if status == "kept":  # the frame that the others are registered to, or the group was rejected before
+        status, mood = ("registered to", "kept") if group["status"] == "kept" else ("not judged", "")
     moved = (frame.get("registration") or {}).get("median_displacement")
-    facts = [f"{key.replace('_', ' ')} {_number(value)}" for key, value in (frame.get("quality") or {}).items()]
     return (
         f'<figure class="{"wide" if wide else "narrow"}"><div class="shots">{"".join(shots)}</div>'
-        f'<figcaption><b>{_text(frame["name"])}</b> <span class="tag {frame["status"]}">{_text(status)}</span>'
+        f'<figcaption><b>{_text(frame["name"])}</b> <span class="tag {mood}">{_text(status)}</span>'
         + (f" moved {_number(moved, '.2f')} px" if moved is not None else "")
         + _remarks(frame["reasons"], "dropped")
         + _remarks(frame["warnings"], "warning")
-        + f'<div class="facts">{_text(" · ".join(facts))}</div></figcaption></figure>'
+        + "</figcaption></figure>"
     )
 
 
-def _registrations(frames: list[dict]) -> str:
-    """Every figure of every frame's registration, and what the paper's rule alone would have said."""
+def _figures(frames: list[dict]) -> str:
+    """Every figure of every frame, what the paper's rule alone would have said of its registration included."""
+    measured = list(dict.fromkeys(key for frame in frames for key in frame.get("quality") or {}))
     rows = []
     for frame in frames:
-        found = frame.get("registration")
-        if found:
-            paper = found.get("paper_exact") or {}
-            verdict = {True: "accepts", False: "refuses"}.get(paper.get("accepted"), "–")
-            moved = paper.get("corner_displacement")
-            verdict += f", corner {_number(moved, '.1f')} px" if moved is not None else ""
-            cells = [_number(found.get(key), form) for key, (_, form) in FIGURES.items()]
-            rows.append([frame["name"], *cells, verdict])
-    if not rows:
+        found, quality = frame.get("registration") or {}, frame.get("quality") or {}
+        paper = found.get("paper_exact") or {}
+        verdict = {True: "accepts", False: "refuses"}.get(paper.get("accepted"), "–")
+        if paper.get("corner_displacement") is not None:
+            verdict += f", corner {_number(paper['corner_displacement'], '.1f')} px"
+        cells = [_number(found.get(key), form) for key, (_, form) in FIGURES.items()]
+        rows.append([frame["name"], *cells, verdict, *(_number(quality.get(key)) for key in measured)])
+    if not any(frame.get("registration") or frame.get("quality") for frame in frames):
         return ""
     head = ["frame", *(heading for heading, _ in FIGURES.values()), "the paper's rule alone"]
-    return f"<details><summary>Registration figures</summary>{_table(head, rows)}</details>"
+    head += [key.replace("_", " ") for key in measured]
+    return f"<details><summary>Figures</summary>{_table(head, rows)}</details>"
 
 
 # ---- pictures ----

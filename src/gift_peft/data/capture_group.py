@@ -115,7 +115,7 @@ def prepare_group(job: Job) -> Outcome:
         group.reject(rejection.reasons)
     except (OSError, ValueError, cv2.error, MemoryError, RecursionError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        group.reject([reason("unreadable", text.replace(f"{job.raw}{os.sep}", ""))])
+        group.reject([reason("unreadable", _printable(text.replace(f"{job.raw}{os.sep}", "")))])
         digest = None  # it may be a passing trouble (permissions, memory): try again next time
     return Outcome(digest, group.entry)
 
@@ -142,7 +142,7 @@ class _Group:
         self.job, self.settings = job, job.settings
         self.capture: Capture | None = None
         self.entry = {
-            "group_id": job.group_id,
+            "group_id": _printable(job.group_id),
             "split": job.split,
             "surface": None,
             "notes": None,
@@ -158,7 +158,7 @@ class _Group:
         }
 
     def _relative(self, path: Path) -> str:
-        return path.relative_to(self.job.raw).as_posix()
+        return _printable(path.relative_to(self.job.raw).as_posix())
 
     def reject(self, reasons: list[dict]) -> None:
         self.entry |= {"status": "rejected", "reasons": reasons}
@@ -174,7 +174,7 @@ class _Group:
         paths += [(capture.reference, "reference")] if capture.reference is not None else []
         self.entry["frames"] = [
             {
-                "name": capture.name(path) if path.is_relative_to(capture.folder) else path.name,
+                "name": _printable(capture.name(path) if path.is_relative_to(capture.folder) else path.name),
                 "role": role,
                 "status": "kept",
                 "reasons": [],
@@ -190,6 +190,9 @@ class _Group:
         ]
 
     def decode(self) -> None:
+        for path in self.capture.images:
+            if str(path) != _printable(str(path)):
+                raise ValueError(f"{path}: the name is not valid Unicode text; rename the file")
         self.decoded = decode_capture(self.capture)
         size = self.decoded.images[0].size
         self.entry["size"] = list(size)
@@ -383,7 +386,7 @@ class _Group:
             check_count(self.job.group_id, count, self.job.split, has_reference)
         except ValueError:
             dropped = [
-                f"{frame['name']}: {frame['reasons'][0]['text']}"
+                f"{frame['name']}: {', '.join(item['text'] for item in frame['reasons'])}"
                 for frame in self.entry["frames"]
                 if frame["status"] == "dropped"
             ]
@@ -463,6 +466,11 @@ def _read_proxy(path: Path) -> np.ndarray:
 
 def _gray(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
+def _printable(text: str) -> str:
+    """File names may hold bytes that are no text; a report may not."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def _finite(value):

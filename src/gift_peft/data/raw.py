@@ -233,7 +233,10 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    """All photos of a group, in natural order; links in a loop and unreadable folders raise OSError or ValueError."""
+    """All photos of a group, in natural order.
+
+    Raises OSError or ValueError: links in a loop, an unreadable folder, a pipe or device that reading would wait for.
+    """
 
     def complain(error: OSError):
         raise error
@@ -246,7 +249,11 @@ def _pictures(folder: Path) -> list[Path]:
             raise ValueError(f"{place}: a link back to a folder above it")
         ancestors[place] = above | {real}
         folders[:] = [name for name in folders if not name.startswith(".") and name not in NOT_PHOTOS]
-        found += [path for path in (Path(place, name) for name in files) if is_image_file(path)]
+        for path in (Path(place, name) for name in files):
+            if path.exists() and not path.is_file():
+                raise ValueError(f"{path}: not a regular file")
+            if is_image_file(path):
+                found.append(path)
     photos = [path for path in found if not is_mask_file(path, folder)]
     return sorted(photos, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 

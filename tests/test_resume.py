@@ -4,6 +4,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -305,3 +307,20 @@ def test_leftovers_are_a_runs_own(tmp_path):
 def test_the_command_to_go_on_survives_a_space(tmp_path):
     text = loop._how_to_resume(tmp_path / "my run", 3)
     assert f"--config '{tmp_path}/my run/config.yaml' --resume" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["torchrun", "accelerate"])
+def test_documented_launch_lines(launcher, base_dir, tree, tmp_path):
+    """The lines of `gift_peft.training`'s docstring, on CPUs."""
+    lines = {
+        "torchrun": [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"],
+        "accelerate": ["accelerate", "launch", "--multi_gpu", "--num_processes=2", "--main_process_port=0"],
+    }
+    options = {"size": "56x70", "max_steps": 2, "proxies_dir": tmp_path / "proxies", "output_dir": tmp_path / "out"}
+    options |= {"model_name_or_path": base_dir, "dataset_name": tree}
+    command = [*lines[launcher], "-m", "gift_peft.training", *(f"--{key}={value}" for key, value in options.items())]
+    environment = os.environ | {"ACCELERATE_USE_CPU": "true", "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert json.loads((tmp_path / "out/adapter/gift.json").read_text())["num_processes"] == 2

@@ -23,7 +23,7 @@ from gift_peft.training import parse_arguments, train
 SIZE = "112x140"
 KINDS = {"mirror": "mirror", "pane": "glass pane", "solid": "glass object"}
 # What differs from the paper's settings, because the model is 200 times smaller and the groups are 4 times fewer.
-SETTINGS = ["--num_train_epochs=8", "--learning_rate=1e-4", "--retain=9", "--checkpoints_total_limit=1"]
+SETTINGS = ["--num_train_epochs=8", "--learning_rate=1e-4", "--checkpoints_total_limit=1"]
 
 
 def run_demo(

@@ -108,15 +108,17 @@ def _align_image(
     usable = valid & known(reference)
     inverts, given_depth = rules.inverts(kind), kind == "depth"
     if inverts and given_depth:
-        # A depth of zero or less has no inverse: it stays out of the fit and ends up at the near end.
-        positive = prediction > 0
+        # A depth of zero or less has no (finite) inverse: it stays out of the fit and ends up at the near end.
+        positive = prediction > np.finfo(np.float64).tiny
         usable &= positive
         prediction = np.divide(1, prediction, out=np.zeros(prediction.shape), where=positive)
     farthest = reference[usable].max() if rules.floor == "ref_max" and inverts and usable.any() else None
     loss = rules.loss_for(kind)
     pixels = nearest_to_grid(usable) if loss == "l1_rel" else usable
     target = reference[pixels]
-    scale, shift = fit(prediction[pixels], 1 / target if inverts else target, rules.dof, loss)
+    if inverts:
+        np.reciprocal(target, out=target)
+    scale, shift = fit(prediction[pixels], target, rules.dof, loss)
     if rules.space == "depth":
         _tell_fit_to_depth(rules, kind, scale)
     aligned = scale * prediction + shift

@@ -2,15 +2,29 @@
 
 import json
 from dataclasses import asdict
+from pathlib import Path
 from types import SimpleNamespace
 
 import huggingface_hub
 import pytest
-from huggingface_hub import ModelCard
+import torch
+import yaml
+from huggingface_hub import DatasetCard, ModelCard
+from reports import random_rows, report_of
 from runs import arguments, train_again
-from tiny import write_raw_tree
+from tiny import write_group, write_raw_tree
+from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
+from gift_peft import (
+    Metric3DConfig,
+    Metric3DForDepthEstimation,
+    VggtConfig,
+    VggtForDepthEstimation,
+    get_gift_model,
+)
+from gift_peft.data.writer import write_gift_i
 from gift_peft.evaluation import cards
+from gift_peft.evaluation.bases import adapter_sizes, find_base
 from gift_peft.evaluation.card_metadata import base_license, is_local, portable_name
 from gift_peft.evaluation.metrics import METRICS
 from gift_peft.training import GiftTrainingArguments, card, loop, start, train
@@ -171,3 +185,124 @@ def test_hub_ids_and_paths(name, local, tmp_path, monkeypatch):
     assert is_local("model")
     assert portable_name("owner/model") == "owner/model"
     assert portable_name(str(tmp_path / "model")) == "model"
+
+
+# ---- evaluations, backbones, data sets ----
+
+
+def test_every_evaluation_keeps_its_own_metrics(tmp_path):
+    """Without a config the Hub's client would merge the metrics of two evaluations on one dataset."""
+    rows = random_rows([2, 3])
+    proxy = report_of(rows)
+    depth = report_of(random_rows([2, 3], seed=1), reference="depth", unit="mm")
+    booster = report_of(random_rows([2, 3], seed=2), booster=True)
+    args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out")
+    record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
+    loaded = ModelCard(cards.model_card(asdict(args), record, [proxy, depth, booster]))
+    found = {}
+    for result in loaded.data.eval_results:
+        found.setdefault((result.dataset_type, result.dataset_config), {})[result.metric_type] = result.metric_value
+    assert list(found) == [
+        ("someone/gift-i", "against the treated-reference proxy, protocol native"),
+        ("someone/gift-i", "against true depth, protocol native"),
+        ("booster", "balanced, protocol gift"),
+    ]
+    for values, report in zip(found.values(), (proxy, depth, booster), strict=True):
+        assert values["tom_rmse"] == pytest.approx(report.summary["tom"]["rmse"], abs=1e-6)
+        assert ("gce" in values) == (report is not booster) and len(values) == 12 + (report is not booster)
+    assert loaded.text.count("95 % bootstrap intervals") == 3
+    for where in ("GIFT-I, proxy", "GIFT-I, depth", "Booster"):
+        assert f"| {where}: RMSE ↓ |" in loaded.text
+
+
+def test_what_got_worse_stands_under_limits():
+    args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out")
+    adapted = ROW | {"val_tom_rmse": 0.2, "val_other_rmse": 0.3}
+    record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
+    limits = cards.model_card(asdict(args), record).split("## Limits")[1]
+    assert "Other RMSE on the validation groups got worse, by 20.0 %" in limits and "ToM RMSE" not in limits
+    report = report_of(random_rows([2, 3]), collapse={"target_mean_ratio": 0.1, "spread_ratio": 1.0, "alarm": True})
+    assert "Collapse alarm on GIFT-I (proxy)" in cards.model_card(asdict(args), record, [report])
+
+
+CARDS = {
+    "depth_anything_v2_large": ("depth-anything/Depth-Anything-V2-Large-hf", "cc-by-nc-4.0", "335,315,649"),
+    "vggt_1b": ("facebook/VGGT-1B", "cc-by-nc-4.0", "941,766,882"),
+    "metric3d_v2_giant": ("JUGGHM/Metric3D", "unknown", "1,377,675,099"),
+}
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_cards_of_backbones_are_what_the_generator_writes(name):
+    arguments = yaml.safe_load((ROOT / "examples" / f"{name}.yaml").read_text())
+    text = (ROOT / "model_cards" / f"{name}.md").read_text()
+    assert text == cards.model_card(arguments)
+    loaded = ModelCard(text)
+    base, license, parameters = CARDS[name]
+    data = loaded.data.to_dict()
+    assert (data["base_model"], data["license"], data["library_name"]) == (base, license, "peft")
+    assert (data["base_model_relation"], data["pipeline_tag"]) == ("adapter", "depth-estimation")
+    assert "model-index" not in data and loaded.text.lower().count("not trained yet") == 2 and parameters in text
+    table = loaded.text.split("## What the paper reports")[1].split("##")[0]
+    assert table.count("\n|") == 6 and "| paper |" in table and "nothing in this table was run here" in table
+
+
+def depth_anything_v2_large():
+    backbone = Dinov2Config(
+        hidden_size=1024,
+        num_hidden_layers=24,
+        num_attention_heads=16,
+        image_size=518,
+        patch_size=14,
+        out_indices=[5, 12, 18, 24],
+        reshape_hidden_states=False,
+        apply_layernorm=True,
+    )
+    neck = {"reassemble_hidden_size": 1024, "neck_hidden_sizes": [256, 512, 1024, 1024], "fusion_hidden_size": 256}
+    return DepthAnythingForDepthEstimation(DepthAnythingConfig(backbone_config=backbone, head_hidden_size=32, **neck))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "build"),
+    [
+        ("depth-anything/Depth-Anything-V2-Large-hf", depth_anything_v2_large),
+        ("facebook/VGGT-1B", lambda: VggtForDepthEstimation(VggtConfig())),
+        ("JUGGHM/Metric3D", lambda: Metric3DForDepthEstimation(Metric3DConfig())),
+    ],
+)
+@pytest.mark.parametrize("head", ["full", "lora", "none"])
+def test_sizes_on_the_card_are_those_of_the_adapter(name, build, head):
+    base = find_base(name)
+    with torch.device("meta"):
+        model = build()
+        assert sum(weight.numel() for weight in model.parameters()) == base.parameters
+        model = get_gift_model(model, rank=4, head=head)
+    trained = [(name, weight.numel()) for name, weight in model.named_parameters() if weight.requires_grad]
+    lora = sum(count for name, count in trained if "lora_" in name)
+    assert adapter_sizes(base, 4)[head] == (lora, sum(count for _, count in trained) - lora)
+    assert model.config.model_type == base.model_type
+
+
+def test_a_trained_folder_is_not_taken_for_the_backbone_it_is_named_after(base_dir, tree, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "vggt-1b").mkdir()
+    args = GiftTrainingArguments("vggt-1b", "someone/gift-i", "out")
+    record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
+    loaded = ModelCard(cards.model_card(asdict(args), record))
+    assert loaded.data.base_model is None and "paper" not in loaded.text
+    with pytest.raises(ValueError, match="needs model_name_or_path"):
+        cards.model_card({})
+
+
+def test_the_dataset_card_is_valid(tmp_path):
+    group = write_group(tmp_path / "group", 2, 0)
+    row = {"split": "train", "group_id": "g", "images": sorted(group.glob("*.png"))}
+    row["masks"] = sorted((group / "masks").glob("*.png"))
+    folder = write_gift_i([row], tmp_path / "gift-i", license="cc-by-4.0", pretty_name="My: mirrors")
+    for path in (folder / "README.md", ROOT / "src/gift_peft/demo/gift-i/README.md"):
+        data = DatasetCard.load(path).data
+        assert data.task_categories == ["depth-estimation"] and data.license and data.pretty_name
+        assert data.to_dict()["configs"][0]["data_files"]
+    assert DatasetCard.load(folder / "README.md").data.pretty_name == "My: mirrors"

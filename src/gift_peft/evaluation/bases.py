@@ -1,11 +1,10 @@
 """The paper's three backbones as their model cards need them: licence, how to get them, input and output, sizes.
 
-Parameter counts come from the architectures themselves, built without weights; figures of the paper are marked so.
+Parameter counts are facts of the architectures (a slow test builds them without weights and counts); figures of the
+paper are marked so.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 # RMSE of the paper's Tables 1 (GIFT-I, proxy units times 1000) and 2 (Booster, mm): base, + GIFT.
 PaperFigures = dict[str, tuple[float, float]]
@@ -21,7 +20,9 @@ class Base:
         license (`str`): of the weights, a Hub licence id; `unknown` where none is stated.
         model_type (`str`): of its transformers config.
         kind (`str`): what it predicts.
-        build (`Callable[[], Any]`): the architecture with random weights (under `torch.device("meta")`: without).
+        parameters (`int`): of the whole model.
+        encoder_lora, head_lora (`int`): LoRA parameters per rank on the encoder's attention, and on the head.
+        head_parameters (`int`): what `head="full"` trains.
         about (`str`): Markdown: origin, licence, how to get it; `{parameters}` and `{gigabytes}` are filled in.
         inout (`str`): Markdown: input and output.
         targets (`str`): where LoRA goes, for the recipe.
@@ -36,7 +37,10 @@ class Base:
     license: str
     model_type: str
     kind: str
-    build: Callable[[], Any]
+    parameters: int
+    encoder_lora: int
+    head_lora: int
+    head_parameters: int
     about: str
     inout: str
     targets: str
@@ -52,64 +56,9 @@ def find_base(name: str | None) -> Base | None:
 
 
 def adapter_sizes(base: Base, rank: int) -> dict[str, tuple[int, int]]:
-    """{head: (LoRA parameters, others)} that `get_gift_model` trains; builds the architecture without weights."""
-    import torch
-
-    from gift_peft.adapters import HEADS, get_gift_model
-
-    sizes = {}
-    for head in HEADS:
-        with torch.device("meta"):
-            model = get_gift_model(base.build(), rank=rank, head=head)
-        trained = [(name, weight.numel()) for name, weight in model.named_parameters() if weight.requires_grad]
-        lora = sum(count for name, count in trained if "lora_" in name)
-        sizes[head] = lora, sum(count for _, count in trained) - lora
-    return sizes
-
-
-def count_parameters(base: Base) -> int:
-    """Of the base model itself."""
-    import torch
-
-    with torch.device("meta"):
-        return sum(weight.numel() for weight in base.build().parameters())
-
-
-def _depth_anything_v2_large():
-    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
-
-    backbone = Dinov2Config(
-        hidden_size=1024,
-        num_hidden_layers=24,
-        num_attention_heads=16,
-        image_size=518,
-        patch_size=14,
-        out_indices=[5, 12, 18, 24],
-        reshape_hidden_states=False,
-        apply_layernorm=True,
-    )
-    return DepthAnythingForDepthEstimation(
-        DepthAnythingConfig(
-            backbone_config=backbone,
-            reassemble_hidden_size=1024,
-            patch_size=14,
-            neck_hidden_sizes=[256, 512, 1024, 1024],
-            fusion_hidden_size=256,
-            head_hidden_size=32,
-        )
-    )
-
-
-def _vggt():
-    from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation
-
-    return VggtForDepthEstimation(VggtConfig())
-
-
-def _metric3d():
-    from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation
-
-    return Metric3DForDepthEstimation(Metric3DConfig())
+    """{head: (LoRA parameters, others)} that `get_gift_model` trains."""
+    encoder, head = rank * base.encoder_lora, rank * base.head_lora
+    return {"full": (encoder, base.head_parameters), "lora": (encoder + head, 0), "none": (encoder, 0)}
 
 
 BASES = (
@@ -119,7 +68,10 @@ BASES = (
         license="cc-by-nc-4.0",
         model_type="depth_anything",
         kind="inverse_depth",
-        build=_depth_anything_v2_large,
+        parameters=335_315_649,
+        encoder_lora=196_608,
+        head_lora=90_177,
+        head_parameters=30_947_009,
         about="""\
 Depth Anything V2 (Yang et al., 2024) is a DINOv2 ViT-L encoder with a DPT neck and head ({parameters}
 parameters, {gigabytes} GB in float32), trained on synthetic pictures and then on its own predictions for real ones.
@@ -146,7 +98,10 @@ checkpoints have the same architecture and predict metres: `examples/depth_anyth
         license="cc-by-nc-4.0",
         model_type="gift_vggt",
         kind="depth",
-        build=_vggt,
+        parameters=941_766_882,
+        encoder_lora=442_368,
+        head_lora=89_154,
+        head_parameters=32_654_562,
         about="""\
 VGGT (Wang et al., 2025) predicts depth, cameras and points of a scene from one or more frames. gift-peft has
 its depth path as a transformers model (`VggtForDepthEstimation`: aggregator and depth head, {parameters} parameters,
@@ -186,7 +141,10 @@ along the camera's axis in a unit of its own per scene (relative, not metres), l
         license="unknown",
         model_type="gift_metric3d",
         kind="depth",
-        build=_metric3d,
+        parameters=1_377_675_099,
+        encoder_lora=368_640,
+        head_lora=322_685,
+        head_parameters=241_188_187,
         about="""\
 Metric3D V2 (Hu et al., 2024) predicts metric depth and surface normals of single images. gift-peft has it as
 a transformers model (`Metric3DForDepthEstimation`; Giant2: {parameters} parameters, {gigabytes} GB in float32) and

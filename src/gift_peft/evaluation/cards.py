@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from gift_peft.evaluation.bases import Base, adapter_sizes, count_parameters, find_base
+from gift_peft.evaluation.bases import Base, adapter_sizes, find_base
 from gift_peft.evaluation.card_metadata import card_metadata, is_local, portable_name
 from gift_peft.evaluation.layout import number, to_markdown
 from gift_peft.evaluation.metrics import METRICS
@@ -57,7 +57,7 @@ def model_card(
     if record is None:
         parts.insert(1, NOT_TRAINED)
     if base:
-        size = count_parameters(base)
+        size = base.parameters
         filled = base.about.replace("{parameters}", f"{size:,}").replace("{gigabytes}", f"{4 * size / 1e9:.2f}")
         parts += [f"## Base model\n\n{filled}", f"## Input and output\n\n{base.inout}"]
     parts += [f"## Use\n\n{_usage(arguments, record, base)}", f"## Results\n\n{_results(record, reports)}"]

@@ -37,12 +37,13 @@ from PIL import Image
 from gift_peft.adapters import get_gift_model
 from gift_peft.data.gift_i import load_gift_i
 from gift_peft.data.preprocess import Group
+from gift_peft.evaluation.predict import load_base
 from gift_peft.group_step import GroupStep
 from gift_peft.training import profiling
 from gift_peft.training.groups import PreparedGroups
 from gift_peft.training.profiling import PHASES, Phases
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
-from gift_peft.training.teacher import load_teacher, make_proxies
+from gift_peft.training.teacher import make_proxies
 
 # ---- what is timed ----
 
@@ -64,7 +65,7 @@ class Bench:
                 write_base(config, base)
                 write_groups(folder / "raw", sizes)
         make_proxies(base, folder / "raw", size=config.size, accelerator=self.accelerator)
-        model, processor = load_teacher(base)
+        model, processor = load_base(base)
         torch.manual_seed(0)
         self.model = get_gift_model(model).to(self.device).eval()
         self.optimizer = make_adam([p for p in self.model.parameters() if p.requires_grad], 2e-5)
@@ -139,7 +140,7 @@ def measure_epochs(bench: Bench, strata: list[Stratum], repeats: int, max_pairs:
     epochs: dict[str, list[Timing]] = {method: [] for method in METHODS}
     for repeat in range(-1, repeats):  # the first warms up
         parts: dict[str, list[Timing]] = {method: [] for method in epochs}
-        for number, stratum in enumerate(strata):
+        for number, stratum in enumerate(strata if repeat >= 0 else strata[:1]):
             order = list(epochs)
             shift = (repeat + number) % len(order)
             for method in order[shift:] + order[:shift]:
@@ -206,7 +207,7 @@ def measure_options(bench: Bench, size: int, repeats: int, compiled: bool) -> di
         variants["compiled blocks"] = (compile_blocks, "auto", None)
     steps = {}
     for name, (change, retain, together) in variants.items():
-        model = get_gift_model(load_teacher(bench.base)[0]).to(bench.device).eval()
+        model = get_gift_model(load_base(bench.base)[0]).to(bench.device).eval()
         if change:
             change(model)
         options = {"accelerator": bench.accelerator, "snapshot_micro_batch_size": together}
@@ -288,7 +289,9 @@ def run_worker(what: str, name: str, folder: Path, processes: int = 1, **environ
 def benchmark(name: str, args: argparse.Namespace, folder: Path) -> dict:
     config = CONFIGS[name]
     strata = make_strata(config.strata)
-    sizes = sorted({stratum.sample for stratum in strata} | {2, args.option_size, *MEMORY_SIZES})
+    sizes = {stratum.sample for stratum in strata} | {args.option_size}
+    with_memory = name == "tiny" or config.device == "cuda"
+    sizes = sorted(sizes | ({2, *MEMORY_SIZES} if with_memory else set()))
     print(f"{name}: preparing {sum(sizes)} pictures", flush=True)
     bench = Bench(name, folder, sizes)
     result: dict = {
@@ -314,7 +317,7 @@ def benchmark(name: str, args: argparse.Namespace, folder: Path) -> dict:
     }
     result["loader_images_per_second"] = measure_loader(bench, seconds=2)
     result["loader_to_step"] = result["loader_images_per_second"] / (images / median(epochs["d"]))
-    result["options_seconds"] = measure_options(bench, args.option_size, args.repeats, args.compile)
+    result["options_seconds"] = measure_options(bench, args.option_size, min(3, args.repeats), args.compile)
     if config.device == "cuda":
         result["memory"] = measure_memory(bench)
     elif name == "tiny":

@@ -4,10 +4,10 @@ One device:
 
     gift-peft train --config run.yaml
 
-Several devices share each group: process r of W forwards and replays its micro-batches r, r+W, ..., the predictions are
-exchanged, the gradients summed, and there is one update per group, as on one device. A group with fewer micro-batches
-than processes leaves some waiting, so use no more processes than groups have pairs of images. Proxies and validation
-are spread by groups. Several GPUs of one machine, by either launcher:
+Several devices share each group: process r of W forwards and replays its micro-batches r, r+W, ..., predictions are
+exchanged, gradients summed, and there is one update per group, as on one device. A group with fewer micro-batches than
+processes leaves some waiting: a group of 10 in micro-batches of 2 keeps five busy. Proxies and validation are spread
+by groups. Several GPUs of one machine, by either launcher:
 
     accelerate launch --multi_gpu --num_processes 4 -m gift_peft.training --config run.yaml
     torchrun --nproc_per_node 4 -m gift_peft.training --config run.yaml

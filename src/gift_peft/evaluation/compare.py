@@ -3,7 +3,7 @@
 import base64
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +72,7 @@ ARTICLE = """<article>
 
 
 def write_compare(
-    panels: Sequence[Panel],
+    panels: Iterable[Panel],
     path: str | Path,
     *,
     title: str = "Before and after",
@@ -81,13 +81,15 @@ def write_compare(
 ) -> Path:
     """One article per panel: photograph, reference, and base and adapted under a slider; colours as in `before_after`.
 
+    Panels are taken one at a time, so that they may come from a generator and need not fit in memory together.
+
     Raises:
         ValueError: no panels, or one whose arrays differ in size.
     """
-    if not panels:
-        raise ValueError("compare.html needs at least one panel")
     names = [html.escape(name) for name in columns]
     articles = "\n".join(_article(panel_row(panel), names) for panel in panels)
+    if not articles:
+        raise ValueError("compare.html needs at least one panel")
     paragraphs = "\n".join(f"<p>{html.escape(note)}</p>" for note in notes)
     write_text(Path(path), PAGE.format(title=html.escape(title), notes=paragraphs, articles=articles))
     return Path(path)

@@ -1,7 +1,9 @@
 """`gift-peft predict` and the loader: files written, values against transformers, and every way it can go wrong."""
 
+import errno
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from PIL import Image
 from tiny import SIZE, tiny_model, tiny_processor, write_base
 from transformers import DepthAnythingForDepthEstimation
 
-from gift_peft.adapters import get_gift_model, save_adapter
+from gift_peft.adapters import RECIPES, get_gift_model, save_adapter
 from gift_peft.data.proxies import teacher_revision
 from gift_peft.evaluation.colormap import GREY, color_range, colorize
 from gift_peft.evaluation.predict import load_model, predict_depth, predict_images
@@ -33,7 +35,7 @@ def adapter_dir(tmp_path_factory, base_dir):
             str(base_dir),
             processor=tiny_processor(),
             size=SIZE,
-            gift={"base_revision": teacher_revision(base_dir)},
+            gift={"base_revision": teacher_revision(base_dir), "kind": "inverse_depth"},
         )
     return folder
 
@@ -137,7 +139,7 @@ def test_missing_things_are_named(base_dir, adapter_dir, photo, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match=r"no images in .*empty"):
         predict_images([tmp_path / "empty"], base_dir, out=out)
-    with pytest.raises(FileNotFoundError, match=r"base model .*nowhere"):
+    with pytest.raises(FileNotFoundError, match=r"base model .*nowhere: no such folder"):
         predict_images([photo], tmp_path / "nowhere", out=out)
     with pytest.raises(FileNotFoundError, match=r"empty: the folder has no adapter_config\.json"):
         predict_images([photo], base_dir, tmp_path / "empty", out=out)
@@ -197,6 +199,44 @@ def test_an_adapter_of_another_hub_id_is_refused(adapter_dir, base_dir, tmp_path
     predict._check_base("org/model-a", None, hub, "org/model-a")
     monkeypatch.undo()
     assert load_model(base_dir, hub).size == SIZE  # a local copy of the hub's model
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("adapter_model.safetensors", cut, "damaged adapter_model.safetensors"),
+        ("adapter_model.safetensors", Path.unlink, "the folder has no adapter_model.safetensors"),
+        ("adapter_config.json", cut, "damaged adapter_config.json"),
+        ("gift.json", cut, "damaged gift.json"),
+        ("preprocessor_config.json", cut, "damaged preprocessor_config.json"),
+    ],
+)
+def test_a_damaged_adapter_names_the_file(name, damage, message, adapter_dir, base_dir, tmp_path):
+    broken = shutil.copytree(adapter_dir, tmp_path / "broken")
+    damage(broken / name)
+    with pytest.raises((ValueError, FileNotFoundError), match=rf"^adapter .*broken: {message}[^\n]*$"):
+        load_model(base_dir, broken)
+
+
+def test_an_adapter_says_what_a_model_without_a_recipe_predicts(adapter_dir, base_dir, monkeypatch):
+    monkeypatch.delitem(RECIPES, "depth_anything")
+    assert load_model(base_dir, size=SIZE).kind is None
+    assert json.loads((adapter_dir / "gift.json").read_text())["kind"] == "inverse_depth"
+    assert load_model(base_dir, adapter_dir).kind == "inverse_depth"
+
+
+def test_a_full_disk_names_the_file_and_leaves_nothing(base_dir, photo, tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("gift_peft.files.os.fsync", full)
+    with pytest.raises(OSError, match=r"No space left.*photo\.npy"):
+        predict_images([photo], base_dir, out=tmp_path / "out", size=SIZE)
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_nan_predictions_are_errors_that_name_the_picture(base_dir, photo, tmp_path):

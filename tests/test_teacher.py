@@ -314,7 +314,7 @@ def test_hub_ids_are_pinned_by_commit(raw_tree, base_dir, tmp_path, monkeypatch)
         return f"/cache/models--owner--net/snapshots/{commits[revision or 'main']}/{name}"
 
     monkeypatch.setattr("transformers.utils.cached_file", cached_file)
-    monkeypatch.setattr(teacher, "load_teacher", lambda base, revision: (tiny_model(), tiny_processor()))
+    monkeypatch.setattr(teacher, "load_base", lambda base, revision: (tiny_model(), tiny_processor()))
     commits["main"] = commits["v1"] = "a" * 40
     assert teacher_id("owner/net") == "owner--net" and teacher_id("owner/net", "v1") == "owner--net@v1"
     assert teacher_revision("owner/net", "v1") == "a" * 40
@@ -383,12 +383,14 @@ def test_nan_predictions_name_group_and_image(raw_tree, base_dir, tmp_path):
 
 
 def test_wrong_bases_and_sizes(raw_tree, base_dir, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"base model .*nowhere: no such folder"):
+        make_proxies(tmp_path / "nowhere", raw_tree)
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match=r"empty: the folder has no config.json"):
         make_proxies(tmp_path / "empty", raw_tree)
     only_model = copy_base(base_dir, tmp_path / "bare")
     (only_model / "preprocessor_config.json").unlink()
-    with pytest.raises(ValueError, match=re.escape(str(only_model))):
+    with pytest.raises(FileNotFoundError, match=re.escape(str(only_model))):
         make_proxies(only_model, raw_tree, size=SIZE)
     with pytest.raises(ValueError, match="multiples of the patch size 14"):
         make_proxies(base_dir, raw_tree, size=(50, 70))

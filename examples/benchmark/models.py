@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from gift_peft.training.teacher import load_teacher
+from gift_peft.evaluation.predict import load_base
 
 PAPER_MINUTES = {"depth-anything-v2-large": 4.53, "vggt-1b": 5.90, "metric3d-v2-giant2": 6.94}
 
@@ -71,7 +71,7 @@ def metric3d(variant):
 
 def embedded():
 
-    return load_teacher(Path(str(files("gift_peft.demo") / "base")))[0]
+    return load_base(Path(str(files("gift_peft.demo") / "base")))[0]
 
 
 CONFIGS = {

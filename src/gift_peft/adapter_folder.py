@@ -19,11 +19,13 @@ from peft import LoraConfig, PeftConfig, PeftModel
 from peft.tuners.lora import LoraLayer
 
 from gift_peft.adapter_scale import active_lora, active_saved_modules
+from gift_peft.files import jsonable
 
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
+PROCESSOR_CONFIG = "preprocessor_config.json"
 GIFT = "gift.json"
-ADAPTER_FILES = {ADAPTER_CONFIG, ADAPTER_WEIGHTS, "preprocessor_config.json", GIFT, "README.md"}
+ADAPTER_FILES = {ADAPTER_CONFIG, ADAPTER_WEIGHTS, PROCESSOR_CONFIG, GIFT, "README.md"}
 MAX_RANK = 4096  # above it an adapter is larger than any layer here, and asks for memory before its weights are read
 
 
@@ -69,7 +71,7 @@ def save_adapter(
         _write_json(temporary / ADAPTER_CONFIG, config)
         if processor is not None:
             # Not save_pretrained: it would put the code of VGGT's and Metric3D's processors beside the adapter.
-            _at_size(processor, size).to_json_file(temporary / "preprocessor_config.json")
+            _at_size(processor, size).to_json_file(temporary / PROCESSOR_CONFIG)
         _write_json(temporary / GIFT, _gift_json(gift, size))
         # Last: PEFT writes a README of its own, which names a local base path.
         (temporary / "README.md").write_text(card or _minimal_card(hub_base), encoding="utf-8")
@@ -148,15 +150,7 @@ def _minimal_card(hub_base: str | None) -> str:
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(_nan_to_null(content), indent=2, default=str, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _nan_to_null(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _nan_to_null(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_nan_to_null(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    path.write_text(json.dumps(jsonable(content), indent=2, default=str, allow_nan=False) + "\n", encoding="utf-8")
 
 
 # ---- reading ----
@@ -191,7 +185,12 @@ def read_adapter_config(adapter: str | Path) -> LoraConfig:
 
 def read_gift(adapter: str | Path) -> dict[str, Any]:
     """An adapter folder's gift.json; empty without one (an adapter that PEFT alone saved, or one on the hub)."""
-    return _read_object(adapter, GIFT) if (Path(adapter) / GIFT).is_file() else {}
+    content = _read_object(adapter, GIFT) if (Path(adapter) / GIFT).is_file() else {}
+    for name, values in (("base_revision", None), ("kind", ("depth", "inverse_depth"))):
+        value = content.get(name)
+        if value is not None and (not isinstance(value, str) or (values and value not in values)):
+            raise ValueError(f"adapter {adapter}: damaged {GIFT} ({name} cannot be {str(value)[:80]!r})")
+    return content
 
 
 def _read_object(adapter: str | Path, name: str) -> dict[str, Any]:

@@ -1,7 +1,10 @@
-"""Writing a file so that a reader finds the old one or the new one, whenever the writer is killed."""
+"""Writing a file so that a reader finds the old one or the new one, whenever the writer is killed; and valid JSON."""
 
+import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
@@ -30,6 +33,15 @@ def write_whole(path: Path, content: bytes | str) -> None:
     for leftover in path.parent.glob(f".{_escaped(path.name)}.*.partial"):
         if leftover.name.removeprefix(f".{path.name}.").removesuffix(".partial").isdigit():  # not of a file "a.b"
             leftover.unlink(missing_ok=True)
+
+
+def jsonable(value: Any) -> Any:
+    """Nested JSON types; numbers that JSON cannot hold (NaN, infinity) become None."""
+    if isinstance(value, Mapping):
+        return {key: jsonable(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _escaped(name: str) -> str:

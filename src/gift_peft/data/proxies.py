@@ -38,6 +38,17 @@ def teacher_id(base: str | Path, revision: str | None = None) -> str:
     return name
 
 
+def check_base_name(base: str | Path) -> None:
+    """Raise FileNotFoundError unless `base` is a folder or could be a hub id."""
+    from huggingface_hub.utils import validate_repo_id
+
+    if not Path(base).is_dir():
+        try:
+            validate_repo_id(str(base))
+        except ValueError:
+            raise FileNotFoundError(f"base model {base}: no such folder") from None
+
+
 def teacher_revision(base: str | Path, revision: str | None = None) -> str:
     """What pins the teacher's weights: the hub commit, or a digest of a local folder's configuration and weights.
 
@@ -55,6 +66,7 @@ def teacher_revision(base: str | Path, revision: str | None = None) -> str:
     from transformers.utils import cached_file
     from transformers.utils.hub import extract_commit_hash
 
+    check_base_name(base)
     try:
         config = cached_file(str(base), "config.json", revision=revision)
     except OSError as error:

@@ -4,11 +4,13 @@ Pictures are resized as in training and the prediction is brought back to each p
 interpolation of transformers' `post_process_depth_estimation`. Values stay in the network's native units.
 """
 
+import io
+import pickle
 import re
 import warnings
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,9 +19,10 @@ from PIL import Image
 from tqdm import tqdm
 
 from gift_peft.data.preprocess import is_image_file, read_image, resolve_size, to_pixel_values
-from gift_peft.data.proxies import teacher_revision
+from gift_peft.data.proxies import check_base_name, teacher_revision
 from gift_peft.data.raw import natural_key
 from gift_peft.evaluation.colormap import color_range, colorize
+from gift_peft.files import write_whole
 
 
 class LoadedModel(NamedTuple):
@@ -29,13 +32,42 @@ class LoadedModel(NamedTuple):
         model (`transformers.PreTrainedModel` or `peft.PeftModel`): the base, or the base under its adapter.
         processor: the image processor, the adapter's where it brings one.
         size (`tuple[int, int]`): (height, width) at the network.
-        kind (`str`, *optional*): `depth` or `inverse_depth`; None for an architecture without a recipe.
+        kind (`str`, *optional*): `depth` or `inverse_depth`; None for an architecture without a recipe, unless the
+            adapter says it.
     """
 
     model: Any
     processor: Any
     size: tuple[int, int]
     kind: str | None
+
+
+def load_base(base: str | Path, revision: str | None = None) -> tuple[Any, Any]:
+    """(model in float32 and eval mode, image processor) of a hub id or folder.
+
+    Raises FileNotFoundError where there is none, ValueError for weights that do not fit or are damaged.
+    """
+    from safetensors import SafetensorError
+    from transformers import AutoImageProcessor, AutoModelForDepthEstimation
+
+    check_base_name(base)
+    options = {"revision": revision, "trust_remote_code": False}  # no question on the terminal, no foreign code
+    try:
+        model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, **options)
+        return model.eval(), AutoImageProcessor.from_pretrained(base, backend="pil", **options)
+    except OSError as error:
+        raise FileNotFoundError(f"base model {base}: {_first_line(error)}") from error
+    except pickle.UnpicklingError:
+        raise ValueError(
+            f"base model {base}: its weights are a pickle that would run code; take safetensors"
+        ) from None
+    except (
+        ValueError,
+        RuntimeError,
+        SafetensorError,
+        UnpicklingError,
+    ) as error:  # of another shape, cut off, no tensors
+        raise ValueError(f"base model {base}: {_first_line(error)}") from error
 
 
 def load_model(
@@ -61,9 +93,7 @@ def load_model(
         FileNotFoundError: no model or adapter at that place.
         ValueError: the adapter was made for another base, or no size is known.
     """
-    from safetensors import SafetensorError
-    from transformers import AutoImageProcessor, AutoModelForDepthEstimation
-
+    from gift_peft.adapter_folder import read_gift
     from gift_peft.adapters import get_recipe, set_adapter_scale
     from gift_peft.models.external import load_external, split_external
 
@@ -74,21 +104,16 @@ def load_model(
         model, processor = load_external(base)
         size = resolve_size(size, None, processor, model.config)
         return LoadedModel(model.to(device).eval(), processor, size, model.config.prediction_kind)
-    try:
-        options = {"revision": revision, "trust_remote_code": False}  # no question on the terminal, no foreign code
-        model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, **options)
-        processor = AutoImageProcessor.from_pretrained(base, backend="pil", **options)
-    except OSError as error:
-        raise FileNotFoundError(f"base model {base}: {_first_line(error)}") from None
-    except (ValueError, RuntimeError, SafetensorError) as error:  # weights of another shape, a cut-off file
-        raise ValueError(f"base model {base}: {_first_line(error)}") from None
+    model, processor = load_base(base, revision)
     config = model.config
     try:
         recipe = get_recipe(model)
     except ValueError:
         recipe = None  # an architecture without a recipe still predicts; its kind has to be told where it matters
+    kind = recipe and recipe.kind_for(config)
     if adapter is not None:
         model, processor = _attach(model, processor, base, adapter, revision)
+        kind = kind or read_gift(adapter).get("kind")
         if adapter_scale is not None:
             set_adapter_scale(model, adapter_scale)
         stated = getattr(processor, "size", None) or {}
@@ -97,7 +122,7 @@ def load_model(
     elif adapter_scale is not None:
         raise ValueError("adapter_scale needs an adapter")
     size = resolve_size(size, recipe, processor, config)
-    return LoadedModel(model.to(device).eval(), processor, size, recipe and recipe.kind_for(config))
+    return LoadedModel(model.to(device).eval(), processor, size, kind)
 
 
 def predict_depth(model: Any, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
@@ -182,9 +207,16 @@ def predict_images(
                 depths[f"{name}_base"] = _at_image_size(predict_depth(loaded.model, pixel_values), image, file)
         low, high = color_range(*depths.values())
         for stem, depth in depths.items():
-            np.save(folder / f"{stem}.npy", depth)
-            Image.fromarray(colorize(depth, low, high, kind or "inverse_depth")).save(folder / f"{stem}.png")
+            picture = Image.fromarray(colorize(depth, low, high, kind or "inverse_depth"))
+            _write(folder / f"{stem}.npy", lambda file, depth=depth: np.save(file, depth))
+            _write(folder / f"{stem}.png", lambda file, picture=picture: picture.save(file, "PNG"))
     return [folder / f"{name}.npy" for name in names]
+
+
+def _write(path: Path, save: Callable[[io.BytesIO], None]) -> None:
+    content = io.BytesIO()
+    save(content)
+    write_whole(path, content.getvalue())
 
 
 def _at_image_size(depth: torch.Tensor, image: Image.Image, file: Path) -> np.ndarray:
@@ -237,7 +269,7 @@ def _attach(model, processor, base, adapter, revision):
     from safetensors import SafetensorError
     from transformers import AutoImageProcessor
 
-    from gift_peft.adapter_folder import ADAPTER_WEIGHTS, read_adapter_config
+    from gift_peft.adapter_folder import ADAPTER_WEIGHTS, PROCESSOR_CONFIG, read_adapter_config
 
     made_for = read_adapter_config(adapter).base_model_name_or_path
     _check_base(base, revision, adapter, made_for)
@@ -252,8 +284,12 @@ def _attach(model, processor, base, adapter, revision):
             raise ValueError(f"{mismatch} ({_first_line(error)})") from None
         except (OSError, SafetensorError) as error:
             raise ValueError(f"adapter {adapter}: damaged {ADAPTER_WEIGHTS} ({_first_line(error)})") from None
-    with suppress(OSError, ValueError):  # an adapter that PEFT alone saved: the base's processor serves
+    try:
         processor = AutoImageProcessor.from_pretrained(adapter, backend="pil", trust_remote_code=False)
+    except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
+        if (Path(adapter) / PROCESSOR_CONFIG).exists():
+            raise ValueError(f"adapter {adapter}: damaged {PROCESSOR_CONFIG} ({_first_line(error)})") from None
+        # An adapter that PEFT alone saved: the base's processor serves.
     return model, processor
 
 
@@ -267,8 +303,6 @@ def _check_base(base, revision, adapter, made_for: str | None) -> None:
     from gift_peft.adapter_folder import read_gift
 
     trained, present = read_gift(adapter).get("base_revision") or "", teacher_revision(base, revision)
-    if not isinstance(trained, str):
-        raise ValueError(f"adapter {adapter}: damaged gift.json (base_revision is a {type(trained).__name__})")
     if not trained and made_for and (Path(made_for) / "config.json").is_file():
         trained = teacher_revision(made_for)
     was_folder, is_folder = (pin.startswith("sha256:") for pin in (trained, present))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.files import write_whole
+from gift_peft.files import jsonable, write_whole
 
 REGIONS = ("tom", "other", "all")
 COLLAPSE_RANGE = (0.5, 2.0)
@@ -43,11 +43,14 @@ class Report:
         for name in ("metrics.json", "rows.jsonl"):
             if not (folder / name).is_file():
                 raise FileNotFoundError(f"no evaluation in {folder}: {name} is missing; run gift-peft evaluate --out")
-        rows = [json.loads(line) for line in (folder / "rows.jsonl").read_text(encoding="utf-8").splitlines()]
-        values = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        path = folder / "rows.jsonl"
+        rows = [_parse(path, line) for line in path.read_text(encoding="utf-8").splitlines()]
+        path = folder / "metrics.json"
+        values = _parse(path, path.read_text(encoding="utf-8"))
         known = {item.name for item in fields(cls)} - {"rows"}
-        if unknown := values.keys() - known:
-            raise ValueError(f"{folder}/metrics.json is no {cls.__name__}: it has {', '.join(sorted(unknown))}")
+        for names, verb in ((values.keys() - known, "has"), (known - values.keys(), "lacks")):
+            if names:
+                raise ValueError(f"{path} is no {cls.__name__}: it {verb} {', '.join(sorted(names))}")
         return cls(rows=rows, **values)
 
 
@@ -57,8 +60,18 @@ def load_report(folder: str | Path) -> "GiftIReport | BoosterReport":
     Raises FileNotFoundError or ValueError where there is none.
     """
     path = Path(folder) / "metrics.json"
-    booster = path.is_file() and "illumination_gce" in json.loads(path.read_text(encoding="utf-8"))
+    booster = path.is_file() and "illumination_gce" in _parse(path, path.read_text(encoding="utf-8"))
     return (BoosterReport if booster else GiftIReport).load(folder)
+
+
+def _parse(path: Path, text: str) -> dict:
+    try:
+        values = json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: damaged ({error})") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: damaged (a {type(values).__name__} where an object is expected)")
+    return values
 
 
 @dataclass
@@ -139,17 +152,6 @@ class BoosterReport(Report):
 def write_text(path: Path, text: str) -> None:
     """Atomic: a reader sees the old file or the new one."""
     write_whole(path, text)
-
-
-def jsonable(value: Any) -> Any:
-    """Nested JSON types; numbers that JSON cannot hold (NaN, infinity) become None."""
-    if isinstance(value, dict):
-        return {key: jsonable(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [jsonable(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def mean(values: list[float]) -> float:

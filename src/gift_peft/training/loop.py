@@ -26,8 +26,10 @@ from gift_peft.evaluation.cards import model_card
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.layout import number
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.results import REGIONS, jsonable
+from gift_peft.evaluation.predict import load_base
+from gift_peft.evaluation.results import REGIONS
 from gift_peft.evaluation.tables import relative_change
+from gift_peft.files import jsonable
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import GeometryConsistencyError
 from gift_peft.training import card, checkpoints
@@ -38,7 +40,7 @@ from gift_peft.training.progress import Progress
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
 from gift_peft.training.start import check_run, claim_folder, make_accelerator, stop_signals, tell_lost_processes
 from gift_peft.training.state import State, write_metrics
-from gift_peft.training.teacher import load_teacher, make_proxies
+from gift_peft.training.teacher import make_proxies
 
 
 @dataclass
@@ -118,7 +120,7 @@ class Run:
         if args.booster_root is not None:
             find_booster(args.booster_root)  # what is wrong with it is said before the proxies are made
         # Float32 weights whatever the checkpoint's: bf16 is autocast's business (paper, implementation details).
-        base, self.processor = load_teacher(args.model_name_or_path, args.model_revision)
+        base, self.processor = load_base(args.model_name_or_path, args.model_revision)
         self.recipe, self.kind = _recipe(args, base)
         self.model_type = base.config.model_type
         self.size = resolve_size(args.size, self.recipe, self.processor, base.config)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import torch
 from accelerate import PartialState
 from accelerate.utils import gather_object, parse_flag_from_env
-from safetensors import SafetensorError
 from tqdm import tqdm
 
 from gift_peft.data.gift_i import gift_i_splits, load_gift_i, proxies_command
@@ -26,24 +25,12 @@ from gift_peft.data.proxies import (
     teacher_revision,
     write_proxies,
 )
-from gift_peft.evaluation.predict import predict_depth
+from gift_peft.evaluation.predict import load_base, predict_depth
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-__all__ = ["load_teacher", "make_proxies", "teacher_id", "teacher_revision"]
-
-
-def load_teacher(base: str | Path, revision: str | None = None) -> tuple[torch.nn.Module, object]:
-    """(model in float32 and eval mode, image processor) of a hub id or folder; ValueError if it is neither."""
-    from transformers import AutoImageProcessor, AutoModelForDepthEstimation
-
-    try:
-        options = {"revision": revision, "trust_remote_code": False}  # no question on the terminal, no foreign code
-        model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, **options)
-        return model.eval(), AutoImageProcessor.from_pretrained(base, **options)
-    except (OSError, ValueError, RuntimeError, SafetensorError) as error:  # weights of another shape, a cut-off file
-        raise ValueError(f"base model {base}: {str(error).strip().splitlines()[0]}") from error
+__all__ = ["make_proxies", "teacher_id", "teacher_revision"]
 
 
 def make_proxies(
@@ -85,7 +72,7 @@ def make_proxies(
     state = accelerator or PartialState(cpu=parse_flag_from_env("ACCELERATE_USE_CPU"))
     identity = teacher_id(base, revision)
     pinned = teacher_revision(base, revision)
-    model, processor = load_teacher(base, revision)
+    model, processor = load_base(base, revision)
     size = resolve_size(size, RECIPES.get(model.config.model_type), processor, model.config)
     model.to(state.device)
     folder = Path(proxies_dir or default_proxies_dir(dataset_path, identity)) / identity

@@ -209,7 +209,8 @@ def _unpack(packed, count: int) -> np.ndarray:
     """Label Studio's brush format, a bit stream: header, then runs of one value or stretches of single values."""
     if not isinstance(packed, list) or not all(type(byte) is int and 0 <= byte < 256 for byte in packed):
         raise ValueError("a brush region's run lengths are not bytes")
-    bits = "".join(f"{byte:08b}" for byte in packed)
+    stream = np.unpackbits(np.array(packed, np.uint8))
+    bits = f"{int.from_bytes(packed):0{8 * len(packed)}b}"  # the same as text, quicker to read a few from
     place = 0
 
     def read(number: int) -> int:
@@ -230,7 +231,13 @@ def _unpack(packed, count: int) -> np.ndarray:
         length = read(sizes[read(2)]) + 1
         if done + length > count:
             raise ValueError("a brush region's run lengths reach beyond the image")
-        values[done : done + length] = read(8) if repeated else [read(8) for _ in range(length)]
+        if repeated:
+            values[done : done + length] = read(8)
+        elif place + 8 * length > len(bits):
+            raise ValueError("a brush region's run lengths are cut short")
+        else:
+            values[done : done + length] = np.packbits(stream[place : place + 8 * length])
+            place += 8 * length
         done += length
     return values
 

@@ -10,6 +10,7 @@ an export knows several labels, `mask_class` names the target's.
 import json
 import os
 import re
+import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -240,11 +241,11 @@ def _entry(names: Sequence[str], image_path: Path, group_dir: Path, export: Path
     In the group's folder the names may be longer (a path from elsewhere) or shorter than the image's path from there;
     above it they must at least name the group, since image names come back in every group.
     """
-    needed = image_path.relative_to(group_dir if inside else group_dir.parent).parts
+    needed = _parts(image_path.relative_to(group_dir if inside else group_dir.parent).as_posix())
     for strip in (False, True):
         matches, short = [], False
         for name in names:
-            parts = PurePosixPath(name).parts
+            parts = _parts(name)
             if strip:
                 parts = (*parts[:-1], UPLOAD_PREFIX.sub("", parts[-1]))
             if parts[-len(needed) :] == needed:
@@ -261,6 +262,10 @@ def _entry(names: Sequence[str], image_path: Path, group_dir: Path, export: Path
                 )
             return matches[0]
     return None
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    return PurePosixPath(unicodedata.normalize("NFC", name)).parts  # macOS decomposes accents in file names
 
 
 def _namesakes(image_path: Path, group_dir: Path) -> bool:

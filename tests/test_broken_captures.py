@@ -167,7 +167,7 @@ BROKEN = {
     "another scene": (lambda g: replaced(g, 0, scene(90, SIZE)), "too_few_frames"),
     "another scene, declared static": (
         lambda g: [replaced(g, 0, scene(90, SIZE)), (g / "group.yaml").write_text("static_rig: true")],
-        "correlation outside the target",
+        "outside the target",
     ),
     "flat frame": (lambda g: replaced(g, 0, np.full((*SIZE, 3), 99, np.uint8)), "too little texture"),
     "black frame, declared static": (

@@ -74,7 +74,7 @@ class Layout:
         if len(references) > 1:
             raise ValueError(f"{folder}: two references, {' and '.join(path.name for path in references[:2])}")
         parts = {
-            name: [_present(folder, template.format(stem=path.stem), raw) for path in images]
+            name: [_present(folder, template.replace("{stem}", path.stem), raw) for path in images]
             for name, template in (("mask", self.mask), ("proxy", self.proxy))
             if template
         }
@@ -155,10 +155,8 @@ def read_layout(path: str | Path) -> Layout:
     for key in ("images", "mask", "proxy", "reference"):
         if key in values:
             _check_relative(values[key], f"layout {path}, {key}")
-            try:
-                values[key].format(stem="")
-            except (KeyError, IndexError, ValueError, AttributeError):
-                raise ValueError(f"layout {path}: {key}: {values[key]!r}; the one placeholder is {{stem}}") from None
+            if {"{", "}"} & set(values[key].replace("{stem}", "")):
+                raise ValueError(f"layout {path}: {key}: {values[key]!r}; the one placeholder is {{stem}}")
     if "columns" in values:
         values["columns"] = tuple(values["columns"])
     return Layout(**values)

@@ -224,9 +224,19 @@ def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.D
         builder = GiftI(data_dir=str(folder))
         builder.download_and_prepare()
         return builder.as_dataset(split=split)
+    except (FileNotFoundError, ValueError):
+        raise
     except datasets.exceptions.DatasetGenerationError as error:
-        cause = error.__cause__
-        raise (cause if isinstance(cause, ValueError | FileNotFoundError) else error) from None
+        if isinstance(cause := error.__cause__, FileNotFoundError | ValueError) and "\n" not in str(cause):
+            raise cause from None
+        raise _unreadable(path, cause or error) from None
+    except (OSError, pa.ArrowException, TypeError, LookupError, AttributeError, RecursionError) as error:
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: str | Path, error: BaseException) -> ValueError:
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+    return ValueError(f"dataset {path}: its metadata cannot be read ({reason})")
 
 
 def _load_from_hub(repository: str, split: str, revision: str | None) -> datasets.Dataset:
@@ -267,7 +277,7 @@ def _check_rows(dataset: datasets.Dataset, split: str, path) -> datasets.Dataset
 
 def _check_row(table: pa.Table, split: str, roots: list[str]) -> tuple[list[int], int]:
     """Of one row: the images to keep, in natural order, and how many there are."""
-    group_id, names = table["group_id"][0].as_py(), table["image_names"][0].as_py()
+    group_id, names = table["group_id"][0].as_py(), table["image_names"][0].as_py() or []
     for column in IMAGE_COLUMNS:
         files = table[column][0].values
         count = 0 if files is None else len(files)

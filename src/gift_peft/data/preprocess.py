@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # torch takes longer to import than the command line takes to
 
 SURFACES = ["mirror", "transparent"]
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm"}
+MAX_SIDE = 16384  # of an image at the network: a damaged file shall not ask for all memory
 SINGLE_CHANNEL = ("1", "L", "P", "I", "I;16", "I;16B", "I;16L")
 
 
@@ -218,6 +219,8 @@ def resolve_size(size, recipe=None, processor=None, config=None) -> tuple[int, i
             f"size {height}x{width}: both sides must be positive multiples of the patch size {multiple}, "
             f"for example {near[0]}x{near[1]}"
         )
+    if max(height, width) > MAX_SIDE:
+        raise ValueError(f"size {height}x{width}: at most {MAX_SIDE} on a side")
     return height, width
 
 

@@ -15,10 +15,9 @@ from PIL import Image
 
 from gift_peft.cli import main
 from gift_peft.data import dataset_fingerprint, load_gift_i, register
-from gift_peft.data.capture_group import PrepareSettings
 from gift_peft.data.captures import prepare
 from gift_peft.data.matching import RegistrationSettings
-from gift_peft.data.prepare_arguments import parse_arguments
+from gift_peft.data.prepare_arguments import PrepareSettings, parse_arguments
 from gift_peft.data.quality import QualitySettings
 
 SIZE = (160, 200)

@@ -3,44 +3,23 @@
 import hashlib
 import json
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image
 
-from gift_peft.data.layout import Layout
-from gift_peft.data.matching import Frame, RegistrationSettings
-from gift_peft.data.quality import QualitySettings, Small, check_frames, check_group_change
+from gift_peft.data.layout import read_proxy
+from gift_peft.data.matching import Frame
+from gift_peft.data.prepare_arguments import PrepareSettings
+from gift_peft.data.quality import Small, check_frames, check_group_change
 from gift_peft.data.raw import Capture, check_count, check_masks, decode_capture, read_capture
-from gift_peft.data.registration import Registration, reason, register, valid_area, warp
+from gift_peft.data.registration import Registration, reason, register, valid_area, warp, warp_stored
 from gift_peft.data.writer import check_group_id, write_group
 
 FORMAT = 1  # of records and report; a new one makes every group again
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything
-
-
-@dataclass(frozen=True)
-class PrepareSettings:
-    """Everything that decides what becomes of a group.
-
-    Args:
-        registration (`RegistrationSettings`), quality (`QualitySettings`): thresholds.
-        static_rig (`bool`): no camera moved, in any group; a `group.yaml` may say it of one.
-        propose_masks (`bool`): propose masks for groups that lack any.
-        accept_proposed_masks (`bool`): use them.
-        refine (`str`, *optional*): "sam2:<model id>", for the proposals' borders.
-        layout (`Layout`, *optional*): default: the raw tree.
-    """
-
-    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
-    quality: QualitySettings = field(default_factory=QualitySettings)
-    static_rig: bool = False
-    propose_masks: bool = False
-    accept_proposed_masks: bool = False
-    refine: str | None = None
-    layout: Layout | None = None
 
 
 @dataclass(frozen=True)
@@ -442,26 +421,12 @@ class _Group:
         folder = self.job.staging / "proxies_given" / self.job.split / self.job.group_id
         for index in kept:
             path = self.capture.proxies[self.decoded.kept[index]]
-            proxy = _read_proxy(path)
+            proxy = read_proxy(path)
             if self._is_warped(index):
-                width, height = self.entry["size"]
-                scale = np.diag([proxy.shape[1] / width, proxy.shape[0] / height, 1.0])
-                scale[:2, 2] = (np.diag(scale)[:2] - 1) / 2  # pixel centres onto pixel centres
-                proxy = warp(proxy, scale @ self.maps[index] @ np.linalg.inv(scale))
+                proxy = warp_stored(proxy, self.maps[index], tuple(self.entry["size"]))
             target = (folder / self.frames[index]["name"]).with_suffix(".npy")
             target.parent.mkdir(parents=True, exist_ok=True)
             np.save(target, proxy)
-
-
-def _read_proxy(path: Path) -> np.ndarray:
-    """(h, w) float32 of a .npy file or a 16-bit PNG; ValueError naming it for anything else, or values not finite."""
-    try:
-        proxy = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.asarray(Image.open(path))
-    except (ValueError, EOFError, SyntaxError) as error:
-        raise ValueError(f"{path}: not a readable proxy ({error})") from None
-    if proxy.ndim != 2 or proxy.dtype.kind not in "fiu" or not np.isfinite(proxy).all():
-        raise ValueError(f"{path}: a proxy is (height, width) finite numbers, got {proxy.shape} {proxy.dtype}")
-    return proxy.astype(np.float32)
 
 
 def _gray(image: np.ndarray) -> np.ndarray:

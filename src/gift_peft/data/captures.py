@@ -68,7 +68,8 @@ import PIL
 from tqdm import tqdm
 
 import gift_peft
-from gift_peft.data.capture_group import FORMAT, Job, Outcome, PrepareSettings, prepare_group
+from gift_peft.data.capture_group import FORMAT, Job, Outcome, prepare_group
+from gift_peft.data.prepare_arguments import PrepareSettings
 from gift_peft.data.raw import SPLITS, find_groups
 from gift_peft.data.writer import write_card, write_rows
 from gift_peft.files import write_whole
@@ -185,8 +186,8 @@ def _run(jobs: list[Job], num_proc: int) -> Iterator[tuple[Job, Outcome]]:
             yield futures[future], future.result()
     except BrokenProcessPool:
         raise OSError(
-            "a process of gift-peft prepare was killed, perhaps for memory; run it again with fewer (--num-proc), "
-            "finished groups are kept"
+            "a process of gift-peft prepare was killed, perhaps for memory, or could not start because the script that "
+            'calls it has no `if __name__ == "__main__":`; finished groups are kept, run again with fewer (--num-proc)'
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)

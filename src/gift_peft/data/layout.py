@@ -26,7 +26,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+import numpy as np
 import yaml
+from PIL import Image
 
 from gift_peft.data.masks import MaskSource
 from gift_peft.data.preprocess import is_image_file
@@ -160,6 +162,17 @@ def read_layout(path: str | Path) -> Layout:
     if "columns" in values:
         values["columns"] = tuple(values["columns"])
     return Layout(**values)
+
+
+def read_proxy(path: Path) -> np.ndarray:
+    """(h, w) float32 of a .npy file or a 16-bit PNG; ValueError naming it for anything else, or values not finite."""
+    try:
+        proxy = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.asarray(Image.open(path))
+    except (ValueError, EOFError, SyntaxError) as error:
+        raise ValueError(f"{path}: not a readable proxy ({error})") from None
+    if proxy.ndim != 2 or proxy.dtype.kind not in "fiu" or not np.isfinite(proxy).all():
+        raise ValueError(f"{path}: a proxy is (height, width) finite numbers, got {proxy.shape} {proxy.dtype}")
+    return proxy.astype(np.float32)
 
 
 def _is_text(value) -> bool:

@@ -6,15 +6,37 @@ import difflib
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import yaml
 
-from gift_peft.data.capture_group import PrepareSettings
-from gift_peft.data.layout import read_layout
+from gift_peft.data.layout import Layout, read_layout
 from gift_peft.data.matching import RegistrationSettings
 from gift_peft.data.quality import QualitySettings
+
+
+@dataclass(frozen=True)
+class PrepareSettings:
+    """Everything that decides what becomes of a group.
+
+    Args:
+        registration (`RegistrationSettings`), quality (`QualitySettings`): thresholds.
+        static_rig (`bool`): no camera moved, in any group; a `group.yaml` may say it of one.
+        propose_masks (`bool`): propose masks for groups that lack any.
+        accept_proposed_masks (`bool`): use them.
+        refine (`str`, *optional*): "sam2:<model id>", for the proposals' borders.
+        layout (`Layout`, *optional*): default: the raw tree.
+    """
+
+    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    quality: QualitySettings = field(default_factory=QualitySettings)
+    static_rig: bool = False
+    propose_masks: bool = False
+    accept_proposed_masks: bool = False
+    refine: str | None = None
+    layout: Layout | None = None
+
 
 PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
 FLAGS = {

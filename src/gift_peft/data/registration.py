@@ -286,6 +286,13 @@ def warp(array: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return cv2.warpPerspective(stored, matrix, (width, height), flags=cv2.INTER_NEAREST).astype(array.dtype)
 
 
+def warp_stored(array: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """An (h, w) map of another size than its frame of `size` (width, height), by the nearest pixel."""
+    scale = np.diag([array.shape[1] / size[0], array.shape[0] / size[1], 1.0])
+    scale[:2, 2] = (np.diag(scale)[:2] - 1) / 2  # pixel centres onto pixel centres
+    return warp(array, scale @ matrix @ np.linalg.inv(scale))
+
+
 def _figures(match: Matches, fixed: Frame) -> dict:
     return {
         "contrast_threshold": match.contrast,

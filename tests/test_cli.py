@@ -95,6 +95,10 @@ def test_wrong_usage_is_2(argv, run):
         (["proxies", "--base", "{base}", "--dataset", "{tmp}/none"], "{tmp}/none"),
         (["proxies", "--base", "{tmp}/none", "--dataset", "{tree}"], "{tmp}/none"),
         (["evaluate", "--base", "{base}", "--dataset", "{tmp}/none"], "{tmp}/none"),
+        (
+            ["evaluate", "--base", "{tmp}/none", "--booster", "{tmp}/nowhere"],
+            "Booster root {tmp}/nowhere: no such folder",
+        ),
         (["predict", "{tmp}/none.png", "--base", "{base}", "--out", "{tmp}/o"], "{tmp}/none.png"),
     ],
 )

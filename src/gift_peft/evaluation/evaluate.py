@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from gift_peft.data.booster import find_booster
 from gift_peft.data.gift_i import load_gift_i
 from gift_peft.data.preprocess import Group, collate_group
 from gift_peft.evaluation.booster import evaluate_booster
@@ -203,6 +204,9 @@ def run_booster(
     if predictions is not None:
         report = evaluate_booster(root, predictions=predictions, kind=kind, **options)
     else:
+        # What is wrong with these is said before large weights are loaded.
+        get_protocol(options.get("protocol", "gift"))
+        find_booster(root, options.get("subset"), options.get("official"))
         loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
         options |= {"processor": loaded.processor, "size": loaded.size, "kind": kind or loaded.kind}
         report = evaluate_booster(root, loaded.model, **options)

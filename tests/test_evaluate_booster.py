@@ -18,7 +18,7 @@ from tiny import SIZE, tiny_model, tiny_processor
 from gift_peft import evaluate_booster
 from gift_peft.data.booster import find_booster, read_ground_truth
 from gift_peft.evaluation.protocols import Protocol
-from gift_peft.evaluation.results import REGIONS, BoosterReport, load_report
+from gift_peft.evaluation.results import REGIONS, BoosterReport, GiftIReport, load_report
 
 SAMPLE = Path(__file__).parents[2] / "shared" / "data" / "booster_web_quarter"
 
@@ -295,6 +295,13 @@ def test_reports_are_saved_and_loaded(tmp_path):
     )  # fmt: skip
     with pytest.raises(FileNotFoundError, match=r"metrics\.json is missing"):
         load_report(tmp_path)
+    with pytest.raises(ValueError, match=r"metrics\.json is no GiftIReport: it has illumination_gce, per_scene"):
+        GiftIReport.load(folder)
+    metrics = (folder / "metrics.json").read_text()
+    for broken, message in ((metrics[:-30], "damaged"), ("[]", "damaged"), ("{}", "is no GiftIReport: it lacks ")):
+        (folder / "metrics.json").write_text(broken)
+        with pytest.raises(ValueError, match=rf"metrics\.json:? {message}"):
+            load_report(folder)
 
 
 @pytest.mark.slow

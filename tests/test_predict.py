@@ -15,7 +15,7 @@ from transformers import DepthAnythingForDepthEstimation
 from gift_peft.adapters import RECIPES, get_gift_model, save_adapter
 from gift_peft.data.proxies import teacher_revision
 from gift_peft.evaluation.colormap import GREY, color_range, colorize
-from gift_peft.evaluation.predict import load_model, predict_depth, predict_images
+from gift_peft.evaluation.predict import load_model, predict_depth, predict_images, prediction_kind
 
 
 @pytest.fixture(scope="module")
@@ -227,6 +227,13 @@ def test_an_adapter_says_what_a_model_without_a_recipe_predicts(adapter_dir, bas
     assert load_model(base_dir, size=SIZE).kind is None
     assert json.loads((adapter_dir / "gift.json").read_text())["kind"] == "inverse_depth"
     assert load_model(base_dir, adapter_dir).kind == "inverse_depth"
+
+
+def test_a_model_without_a_recipe_must_be_told_its_kind(model, monkeypatch):
+    assert prediction_kind(model) == "inverse_depth"
+    monkeypatch.delitem(RECIPES, "depth_anything")
+    with pytest.raises(ValueError, match=r"no recipe says what depth_anything predicts: kind="depth""):
+        prediction_kind(model)
 
 
 def test_a_full_disk_names_the_file_and_leaves_nothing(base_dir, photo, tmp_path, monkeypatch):

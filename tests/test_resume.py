@@ -324,3 +324,27 @@ def test_documented_launch_lines(launcher, base_dir, tree, tmp_path):
     result = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert result.returncode == 0, result.stderr[-2000:]
     assert json.loads((tmp_path / "out/adapter/gift.json").read_text())["num_processes"] == 2
+
+
+def test_a_falling_learning_rate_goes_on_where_it_was(base_dir, tree, tmp_path, monkeypatch):
+    """Linear to 0 over the run, an interruption does not show, and the length is part of what the run is."""
+    rates, step = [], torch.optim.Adam.step
+
+    def recorded(self, *args, **kwargs):
+        rates.append(self.param_groups[0]["lr"])
+        return step(self, *args, **kwargs)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", recorded)
+    falling = {"lr_scheduler_type": "linear", "learning_rate": 4e-4}
+    train(arguments(base_dir, tree, tmp_path / "whole", **falling))
+    assert rates == pytest.approx([4e-4, 3e-4, 2e-4, 1e-4])
+
+    args = arguments(base_dir, tree, tmp_path / "out", **falling)
+    with monkeypatch.context() as patch:
+        stop = on_call(3, GroupStep.accumulate, lambda *a: os.kill(os.getpid(), signal.SIGINT))
+        patch.setattr(GroupStep, "accumulate", stop)
+        train(args)
+    train_again(args)
+    assert_same_run(tmp_path / "out", tmp_path / "whole")
+    with pytest.raises(ValueError, match="resume_from_checkpoint: num_train_epochs: .*changed since the checkpoint"):
+        train_again(args, num_train_epochs=3)

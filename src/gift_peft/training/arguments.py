@@ -23,7 +23,7 @@ FREE_TO_CHANGE = {
     "proxies_dir",
     "output_dir",
     "overwrite_output_dir",
-    "num_train_epochs",  # the learning rate is constant, so a longer run has the shorter one as its beginning
+    "num_train_epochs",  # a longer run has the shorter one as its beginning, unless the learning rate falls: FALLING
     "max_steps",
     "retain",  # gradients do not depend on it, to the bit on CPU
     "dataloader_num_workers",
@@ -42,6 +42,7 @@ FREE_TO_CHANGE = {
     "hub_private_repo",
     "config",
 }
+FALLING = {"num_train_epochs", "max_steps"}  # part of what a run is where its learning rate falls over its length
 
 
 def _arg(text: str, default=...):
@@ -88,7 +89,8 @@ class GiftTrainingArguments:
     channels_last: bool = _arg("the head's convolutions in channels-last layout; changes the bits", False)
     num_train_epochs: int = _arg("passes over the groups, one update per group", 50)
     max_steps: int = _arg("stop after this many updates; -1: num_train_epochs decides", -1)
-    learning_rate: float = _arg("Adam's learning rate, constant", 2e-5)
+    learning_rate: float = _arg("Adam's learning rate at the first update", 2e-5)
+    lr_scheduler_type: Literal["constant", "linear"] = _arg("constant, or falling linearly towards 0", "constant")
     adam_beta1: float = _arg("Adam's beta1", 0.9)
     adam_beta2: float = _arg("Adam's beta2", 0.999)
     adam_epsilon: float = _arg("Adam's epsilon", 1e-8)

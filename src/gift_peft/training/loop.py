@@ -33,7 +33,7 @@ from gift_peft.files import jsonable
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import GeometryConsistencyError
 from gift_peft.training import card, checkpoints
-from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
+from gift_peft.training.arguments import FALLING, FREE_TO_CHANGE, GiftTrainingArguments
 from gift_peft.training.groups import PreparedGroups, epoch_order
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress
@@ -183,7 +183,8 @@ class Run:
     def _identity(self) -> dict:
         """What must be the same for a resumed run, under the names of the arguments."""
         args = self.args
-        identity = {k: v for k, v in asdict(args).items() if k not in FREE_TO_CHANGE}
+        free = FREE_TO_CHANGE - (FALLING if args.lr_scheduler_type == "linear" else set())
+        identity = {k: v for k, v in asdict(args).items() if k not in free}
         parts = [groups for groups in (self.train_groups, self.validation_groups) if groups]
         fingerprint = [None]
         if self.accelerator.is_main_process:
@@ -233,6 +234,9 @@ class Run:
         """One Adam step on one group (Eq. 6); returns (loss, consistency)."""
         try:
             output = self.group_step.accumulate(group.pixel_values, group.mask, group.target, group.valid, group.names)
+            if self.args.lr_scheduler_type == "linear":
+                # from the step alone: a resumed run needs no state of a scheduler
+                self.optimizer.param_groups[0]["lr"] = self.args.learning_rate * (1 - state.step / self.total_steps)
             self.optimizer.step()
             weights = [p.detach() for p in self.optimizer.param_groups[0]["params"]]
             if not torch.nn.utils.get_total_norm(weights, torch.inf).isfinite():

@@ -16,8 +16,9 @@ from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.figures import before_after
 from gift_peft.evaluation.panels import group_panels
 from gift_peft.evaluation.predict import load_model
-from gift_peft.evaluation.results import GiftIReport, write_text
+from gift_peft.evaluation.results import GiftIReport
 from gift_peft.evaluation.tables import markdown_table, text_table
+from gift_peft.files import write_whole
 from gift_peft.training import parse_arguments, train
 
 SIZE = "112x140"
@@ -76,7 +77,7 @@ def run_demo(
         report.save(out / f"evaluation-{reference}")
         reports[reference] = report
     before_after(_panels(groups, reports["depth"], loaded), out / "before_after.png")
-    write_text(out / "report.md", _markdown(reports, args))
+    write_whole(out / "report.md", _markdown(reports, args))
     _print_summary(reports, out)
     return reports
 

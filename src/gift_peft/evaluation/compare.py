@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from gift_peft.evaluation.figures import GridRow, Panel, outline, panel_row
-from gift_peft.evaluation.results import write_text
+from gift_peft.files import write_whole
 
 MIN_SIDE = 320  # smaller tiles are enlarged, so that the outline is a line and not a row of blocks
 
@@ -91,7 +91,7 @@ def write_compare(
     if not articles:
         raise ValueError("compare.html needs at least one panel")
     paragraphs = "\n".join(f"<p>{html.escape(note)}</p>" for note in notes)
-    write_text(Path(path), PAGE.format(title=html.escape(title), notes=paragraphs, articles=articles))
+    write_whole(Path(path), PAGE.format(title=html.escape(title), notes=paragraphs, articles=articles))
     return Path(path)
 
 

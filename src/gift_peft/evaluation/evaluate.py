@@ -34,10 +34,10 @@ from gift_peft.evaluation.results import (
     detect_collapse,
     summarize,
     summarize_gce,
-    write_text,
 )
 from gift_peft.evaluation.scoring import NO_DEPTH, Task, evaluate_group
 from gift_peft.evaluation.tables import markdown_table, text_table
+from gift_peft.files import write_whole
 
 REFERENCES = {"proxy": "native", "depth": "gift"}  # and the protocol that goes with each
 
@@ -224,7 +224,7 @@ def run_booster(
 def write_report(report: GiftIReport | BoosterReport, out: str | Path, color: bool = False) -> None:
     """Leaves the report in a folder and prints its table."""
     folder = report.save(out)
-    write_text(folder / "report.md", markdown_table(report))
+    write_whole(folder / "report.md", markdown_table(report))
     print(text_table(report, color=color))
     print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
 

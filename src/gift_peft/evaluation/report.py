@@ -18,11 +18,12 @@ from gift_peft.evaluation.compare import write_compare
 from gift_peft.evaluation.curves import draw_dynamics, draw_retention
 from gift_peft.evaluation.figures import Panel, before_after, error_maps
 from gift_peft.evaluation.layout import Table, to_csv, to_latex, to_markdown, to_text
-from gift_peft.evaluation.results import BoosterReport, write_text
+from gift_peft.evaluation.results import BoosterReport
 from gift_peft.evaluation.runs import SavedRun, read_run, run_names
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table, protocol_note, uncertainty_table
 from gift_peft.evaluation.zero_shot import draw_zero_shot
+from gift_peft.files import write_whole
 
 COMPARED_GROUPS = 40  # compare.html has one observation of that many groups at most: it has to open in a browser
 
@@ -41,7 +42,7 @@ class Output:
         folder = self.folder / "tables"
         folder.mkdir(exist_ok=True)
         for suffix, write in (("txt", to_text), ("md", to_markdown), ("tex", to_latex), ("csv", to_csv)):
-            write_text(folder / f"{name}.{suffix}", write(table))
+            write_whole(folder / f"{name}.{suffix}", write(table))
         self.sections.append(to_markdown(table))
         if show:
             print(to_text(table, self.color))
@@ -129,7 +130,7 @@ def run_report(
 def _write_card(run: SavedRun, path: Path) -> Path:
     reports = [report for report in run.evaluations.values() if _is_of_adapter(run, report)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, model_card(run.arguments, run.record, reports))
+    write_whole(path, model_card(run.arguments, run.record, reports))
     print(f"Model card: {path}")
     return path
 
@@ -378,7 +379,7 @@ def _zero_shot(
 def _write_markdown(names: Sequence[str], output: Output) -> None:
     head = f"# GIFT: {', '.join(dict.fromkeys(names))}\n"
     missing = [f"Not in this report: {remark}\n" for remark in output.remarks]
-    write_text(output.folder / "report.md", "\n".join([head, *output.sections, *missing]))
+    write_whole(output.folder / "report.md", "\n".join([head, *output.sections, *missing]))
 
 
 def _line(error: Exception) -> str:

@@ -32,8 +32,8 @@ class Report:
         """Writes `metrics.json` and `rows.jsonl`, each at once or not at all; returns the folder."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / "rows.jsonl", "".join(json.dumps(jsonable(row)) + "\n" for row in self.rows))
-        write_text(folder / "metrics.json", json.dumps(self.to_dict(), indent=2) + "\n")
+        write_whole(folder / "rows.jsonl", "".join(json.dumps(jsonable(row)) + "\n" for row in self.rows))
+        write_whole(folder / "metrics.json", json.dumps(self.to_dict(), indent=2) + "\n")
         return folder
 
     @classmethod
@@ -147,11 +147,6 @@ class BoosterReport(Report):
     groups: list[dict]
     rows: list[dict] = field(repr=False)
     about: dict = field(default_factory=dict)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Atomic: a reader sees the old file or the new one."""
-    write_whole(path, text)
 
 
 def mean(values: list[float]) -> float:

@@ -18,7 +18,7 @@ from accelerate import Accelerator, PartialState
 from accelerate.state import AcceleratorState
 from accelerate.utils import ProjectConfiguration, parse_flag_from_env
 
-from gift_peft.evaluation.results import write_text
+from gift_peft.files import write_whole
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.card import check_push
 from gift_peft.training.checkpoints import checkpoint_fault, find_checkpoint, list_checkpoints, remove_leftovers
@@ -81,7 +81,7 @@ def claim_folder(args: GiftTrainingArguments, accelerator: Accelerator, fresh: b
     if accelerator.is_main_process:
         if fresh:
             _delete_run(Path(args.output_dir))
-        write_text(Path(args.output_dir) / "config.yaml", args.to_yaml())
+        write_whole(Path(args.output_dir) / "config.yaml", args.to_yaml())
     accelerator.wait_for_everyone()
 
 

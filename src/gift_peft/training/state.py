@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gift_peft.evaluation.results import write_text
+from gift_peft.files import write_whole
 
 
 @dataclass
@@ -49,4 +49,4 @@ class State:
 
 def write_metrics(output: Path, rows: list[dict]) -> None:
     """metrics.jsonl, whole: a resumed run drops the rows after its checkpoint."""
-    write_text(output / "metrics.jsonl", "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+    write_whole(output / "metrics.jsonl", "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))

@@ -420,6 +420,7 @@ def work(folder):
                 answers[name, count, cut] = runs
         answers[name, "trained"] = train(gift_model(dtype, spread=0), accelerator, dtype)
 
+    answers["auto"] = [GroupStep(toy(), accelerator=accelerator).accumulate(*group(n, torch.float32)) for n in COUNTS]
     model, (pixels, mask, target, _) = toy(), group(2, torch.float32)
     for parameter in model.parameters():
         parameter.grad = torch.full_like(parameter, 100)
@@ -516,6 +517,11 @@ def test_two_processes_add_this_group_only(two):
     for answers in two:
         assert largest_error(answers["on top"], want) < 1e-5
         assert largest_error(answers["after errors"], answers["on top"]) == 0
+
+
+def test_two_processes_retain_what_each_has_room_for(two):
+    for answers in two:
+        assert [output.forwards for output in answers["auto"]] == list(COUNTS)
 
 
 def test_two_processes_raise_together(two):

@@ -197,6 +197,7 @@ def test_a_cgroup_limits_what_is_available(monkeypatch):
 def test_processes_of_a_machine_share_its_memory(monkeypatch):
     monkeypatch.setattr(retention, "available_memory", lambda: GIB)
     model, (pixels, *_) = toy(), group(2, torch.float32)
+    assert str(GraphBudget(model)) == "retain auto: nothing measured yet"
     sizes = []
     for processes in (1, 2):
         budget = GraphBudget(model, processes)

@@ -64,6 +64,11 @@ def test_channels_last_changes_the_trained_head_only():
         assert torch.equal(model(pixel_values=data[0]).predicted_depth, teacher)
 
 
+def test_channels_last_wants_a_head_that_is_trained(model):
+    with pytest.raises(ValueError, match="head: full"):
+        use_channels_last(get_gift_model(model, head="lora"))
+
+
 def test_adam_is_pytorchs_in_one_kernel():
     """Against the plain loop over the weights, in float64."""
     torch.manual_seed(0)

@@ -3,7 +3,7 @@
 Recomputing gives the same bits, compiling and channels-last do not: they are for those who ask.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
 
 import torch
@@ -61,18 +61,15 @@ def use_channels_last(model: PeftModel) -> None:
     """Hand each convolution of the trained head its input in channels-last layout, which the rest then follows.
 
     The inputs and not the weights, so that gradients, optimizer and files keep their layout. The teacher's frozen head
-    keeps its bits.
+    keeps its bits. Raises ValueError for a head that is not trained in full.
     """
-    for head in _trained_heads(model):
-        for module in head.modules():
+    heads = [module for module in model.modules() if isinstance(module, ModulesToSaveWrapper)]
+    if not heads:
+        raise ValueError("channels_last is for a head that is trained in full (head: full)")
+    for wrapper in heads:
+        for module in wrapper.modules_to_save.modules():
             if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
                 module.register_forward_pre_hook(_channels_last_input)
-
-
-def _trained_heads(model: PeftModel) -> Iterator[nn.Module]:
-    for module in model.modules():
-        if isinstance(module, ModulesToSaveWrapper):
-            yield from module.modules_to_save.values()
 
 
 def _channels_last_input(module: nn.Module, args: tuple) -> tuple:

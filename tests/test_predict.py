@@ -232,7 +232,7 @@ def test_an_adapter_says_what_a_model_without_a_recipe_predicts(adapter_dir, bas
 def test_a_model_without_a_recipe_must_be_told_its_kind(model, monkeypatch):
     assert prediction_kind(model) == "inverse_depth"
     monkeypatch.delitem(RECIPES, "depth_anything")
-    with pytest.raises(ValueError, match=r"no recipe says what depth_anything predicts: kind="depth""):
+    with pytest.raises(ValueError, match="no recipe says what depth_anything predicts: kind="):
         prediction_kind(model)
 
 

@@ -66,12 +66,12 @@ def test_a_coarse_disparity_of_a_real_pair_against_hand_computed_numbers(motorcy
     true = 1 / depth[seen]
     design = np.stack([coarse[seen], np.ones(seen.sum())], 1)
     scale, shift = np.linalg.lstsq(design, true, rcond=None)[0]
-    kept = region(seen)
+    kept, lowest = region(seen), true.min()
     pairs = []
     for value, y in zip(coarse[kept], depth[kept], strict=True):
         inverse = scale * value + shift
         if protocol == "moge-affine":
-            pairs.append((1 / max(inverse, true.min()), y))
+            pairs.append((1 / max(inverse, lowest), y))
         else:
             pairs.append((min(max(1 / inverse, 1), 10000), y))
     expected = metrics_by_hand(pairs)

@@ -175,8 +175,10 @@ def run_evaluation(
         "adapter": adapter and str(adapter),
         "adapter_scale": adapter_scale,
         "dataset": str(dataset),
+        "dataset_revision": dataset_revision,
         "split": split,
         "size": list(loaded.size),
+        "kind": kind or loaded.kind,
     }
     write_report(report, out, color)
     return report

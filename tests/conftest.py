@@ -6,9 +6,13 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import datasets
 import pytest
 import torch
+from records import records
 from tiny import tiny_model, write_base, write_raw_tree
+
+from gift_peft.data import register, write_gift_i
 
 torch.set_num_threads(1)
 
@@ -37,3 +41,16 @@ def base_dir(tmp_path_factory):
 def raw_tree(tmp_path):
     """RAW with two train groups (2 and 3 images) and one validation group (2 images and a reference)."""
     return write_raw_tree(tmp_path / "raw")
+
+
+@pytest.fixture
+def prepared(tmp_path, raw_tree):
+    """The groups of `raw_tree` as a prepared folder, with valid masks and depths for some of them."""
+    return write_gift_i(records(raw_tree), tmp_path / "gift-i", license="cc0-1.0", pretty_name="Tiny: a test")
+
+
+@pytest.fixture
+def fresh_cache(tmp_path_factory, monkeypatch):
+    """No test sees what another, or the user, has cached."""
+    register()
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
+from gift_peft.casting import cast_frozen_once
 from gift_peft.losses import GiftLoss, gift_loss, require_finite
 from gift_peft.retention import GraphBudget, local_processes
 
@@ -132,14 +133,15 @@ class GroupStep:
 
         canvas = torch.zeros(mask.shape, dtype=torch.promote_types(parameters[0].dtype, torch.float32), device=device)
         graphs: dict[int, Tensor] = {}
-        num_retained = self._snapshot(pixel_values, batches, canvas, graphs)
-        require_finite(canvas, "the prediction", names)
-        with self.phase("loss"):
-            differentiate = partial(self._differentiate, canvas, target, mask, valid)
-            loss, gradient = self._recovering(differentiate, pixel_values, graphs)
-        if not loss.total.isfinite():  # differences of finite predictions overflow; their signs do not
-            raise ValueError("the loss of this group is NaN or infinite")
-        self._add_gradients(parameters, partial(self._replay, parameters, pixel_values, batches, gradient, graphs))
+        with cast_frozen_once(self.model) if self.mixed_precision == "bf16" else nullcontext():
+            num_retained = self._snapshot(pixel_values, batches, canvas, graphs)
+            require_finite(canvas, "the prediction", names)
+            with self.phase("loss"):
+                differentiate = partial(self._differentiate, canvas, target, mask, valid)
+                loss, gradient = self._recovering(differentiate, pixel_values, graphs)
+            if not loss.total.isfinite():  # differences of finite predictions overflow; their signs do not
+                raise ValueError("the loss of this group is NaN or infinite")
+            self._add_gradients(parameters, partial(self._replay, parameters, pixel_values, batches, gradient, graphs))
         return GroupStepOutput(*loss, forwards=2 * len(mask) - num_retained)
 
     def _snapshot(self, pixel_values: Tensor, batches: list[slice], canvas: Tensor, graphs: dict[int, Tensor]) -> int:

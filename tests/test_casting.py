@@ -1,0 +1,102 @@
+"""One cast per frozen weight and group: autocast's bits, smaller graphs, and weights that are back afterwards."""
+
+import math
+
+import pytest
+import torch
+from accelerate import Accelerator
+from accelerate.state import AcceleratorState
+from test_group_step import gift_model, gradients, group, largest_error
+from torch import nn
+
+from gift_peft import group_step
+from gift_peft.casting import cast_frozen_once
+from gift_peft.group_step import GroupStep
+from gift_peft.retention import graph_bytes
+
+
+@pytest.fixture
+def accelerator():
+    AcceleratorState._reset_state(reset_partial_state=True)
+    yield Accelerator(cpu=True, mixed_precision="bf16")
+    AcceleratorState._reset_state(reset_partial_state=True)
+
+
+def snapshot_of(model):
+    return {name: (p, p.dtype, p.detach().clone()) for name, p in model.named_parameters()}
+
+
+def assert_unchanged(model, before):
+    assert [name for name, _ in model.named_parameters()] == list(before)
+    for name, p in model.named_parameters():
+        assert p is before[name][0] and p.dtype == before[name][1] and torch.equal(p, before[name][2])
+    hooks = [h for m in model.modules() for h in (*m._forward_hooks.values(), *m._forward_pre_hooks.values())]
+    assert not any(hook.__module__ == "gift_peft.casting" for hook in hooks)  # transformers has some of its own
+
+
+@pytest.mark.parametrize("retain", [0, 2, 5])
+def test_the_step_has_autocasts_bits(accelerator, monkeypatch, retain):
+    model, data = gift_model(torch.float32), group(5, torch.float32)
+    before = snapshot_of(model)
+    step = GroupStep(model, retain=retain, accelerator=accelerator)
+    output = step.accumulate(*data)
+    got = gradients(model)
+    model.zero_grad()
+    with monkeypatch.context() as patch:
+        patch.setattr(group_step, "cast_frozen_once", lambda model: group_step.nullcontext())
+        expected = step.accumulate(*data)
+    assert output == expected
+    assert largest_error(got, gradients(model)) == 0
+    assert_unchanged(model, before)
+
+
+def test_a_weight_is_cast_once_and_its_cast_is_kept_once():
+    """Two forwards: without, each graph has its own half-precision copy of the frozen weights."""
+    model, (pixels, *_) = gift_model(torch.float32), group(4, torch.float32)
+
+    def forward():
+        with torch.autocast("cpu", torch.bfloat16, cache_enabled=False):
+            return torch.cat([model(pixel_values=x).predicted_depth for x in pixels.split(2)])
+
+    apart = graph_bytes(model, forward)[1]
+    with cast_frozen_once(model):
+        shared = graph_bytes(model, forward)[1]
+    layers = [m for m in model.base_model.model.backbone.encoder.modules() if type(m) is nn.Linear]
+    frozen = sum(2 * m.weight.numel() for m in layers if not m.weight.requires_grad)
+    assert frozen * 0.9 < apart - shared < frozen * 1.1  # the first block's query needs no gradient of its input
+
+
+def test_outside_of_autocast_layers_stay_in_float32():
+    class Model(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.low, self.exact = (nn.Linear(3, 3).requires_grad_(False) for _ in range(2))
+
+        def forward(self, x):
+            low = self.low(x.to(self.low.weight.dtype))
+            with torch.autocast("cpu", enabled=False):
+                return low, self.exact(low.to(self.exact.weight.dtype))
+
+    model = Model()
+    with cast_frozen_once(model), torch.autocast("cpu", torch.bfloat16):
+        low, exact = model(torch.ones(2, 3))
+    assert (low.dtype, exact.dtype) == (torch.bfloat16, torch.float32)
+
+
+def test_weights_are_back_after_an_error(accelerator):
+    model, data = gift_model(torch.float32), group(3, torch.float32)
+    layer = model.base_model.model.backbone.encoder.layer[1].mlp.fc1
+
+    def fail(x):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    before = snapshot_of(model)
+    layer.forward = fail
+    with pytest.raises(torch.OutOfMemoryError):
+        GroupStep(model, accelerator=accelerator).accumulate(*data)
+    assert_unchanged(model, before)
+    del layer.forward
+    data[2][0, 0, 0] = math.nan
+    with pytest.raises(ValueError, match="proxy"):
+        GroupStep(model, accelerator=accelerator).accumulate(*data)
+    assert_unchanged(model, before)

@@ -1,8 +1,8 @@
 """`evaluate_gift_i` on groups whose predictions are known to the pixel, and end to end on a tiny raw tree."""
 
 import json
-import re
 import math
+import re
 from pathlib import Path
 
 import numpy as np

@@ -6,7 +6,7 @@ import pytest
 from photos import scene, target, with_content
 
 from gift_peft.data import quality
-from gift_peft.data.quality import QualitySettings, Small, check_frames, check_group_change
+from gift_peft.data.quality import QualitySettings, Small, check_group_change, pairwise_changes
 
 SIZE = (240, 320)
 
@@ -24,6 +24,10 @@ def group(seed, noise=3.0, count=2):
 
 def smalls(grays, mask):
     return [Small(image, mask, None) for image in grays]
+
+
+def check_frames(names, frames, grays, target_frame, settings):
+    return quality.check_frames(names, frames, grays, target_frame, pairwise_changes(frames), settings)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -101,10 +105,19 @@ def test_a_group_that_teaches_nothing():
     grays, mask = group(2, noise=0, count=1)
     rng = np.random.default_rng(0)
     same = [np.clip(grays[0] + rng.normal(0, 4, SIZE), 0, 255).astype(np.uint8) for _ in range(3)]
-    most, complaint = check_group_change(smalls(same, mask), QualitySettings())
+    most, complaint = check_group_change(pairwise_changes(smalls(same, mask)), QualitySettings())
     assert most < 1.5 and "teaches nothing" in complaint  # noise is not a change
     grays, mask = group(2)
-    assert check_group_change(smalls(grays, mask), QualitySettings())[1] is None
-    assert check_group_change(smalls(grays[:1], mask), QualitySettings()) == (None, None)
+    assert check_group_change(pairwise_changes(smalls(grays, mask)), QualitySettings())[1] is None
+    assert check_group_change(pairwise_changes(smalls(grays[:1], mask)), QualitySettings()) == (None, None)
     apart = [Small(grays[0], mask, None), Small(grays[1], np.roll(mask, 120, axis=0), None)]
-    assert "no two frames overlap" in check_group_change(apart, QualitySettings())[1]
+    assert "no two frames overlap" in check_group_change(pairwise_changes(apart), QualitySettings())[1]
+
+
+def test_a_thin_target_is_still_one():
+    grays, _ = group(3)
+    thin = np.zeros(SIZE, bool)
+    thin[100:102, 40:280] = True
+    one, other = smalls(grays, thin)
+    assert one.mask_area == thin.mean() and one.inside.any() and quality.target_change(one, other) is not None
+    assert not Small(grays[0], np.zeros(SIZE, bool), None).inside.any()

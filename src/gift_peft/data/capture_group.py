@@ -13,7 +13,7 @@ from PIL import Image
 from gift_peft.data.layout import read_proxy
 from gift_peft.data.matching import Frame
 from gift_peft.data.prepare_arguments import PrepareSettings
-from gift_peft.data.quality import Small, check_frames, check_group_change
+from gift_peft.data.quality import Small, check_frames, check_group_change, pairwise_changes
 from gift_peft.data.raw import Capture, check_count, check_masks, decode_capture, read_capture
 from gift_peft.data.registration import Registration, reason, register, valid_area, warp, warp_stored
 from gift_peft.data.writer import check_group_id, write_group
@@ -298,8 +298,9 @@ class _Group:
         ]
         quality = self.settings.quality
         names = [self.frames[index]["name"] for index in kept]
+        changes = pairwise_changes(smalls)
         for index, figures, reasons, warnings in zip(
-            kept, *check_frames(names, smalls, grays, target, quality), strict=True
+            kept, *check_frames(names, smalls, grays, target, changes, quality), strict=True
         ):
             frame = self.frames[index]
             frame["quality"] = {key: _finite(value) for key, value in figures.items()}
@@ -309,9 +310,9 @@ class _Group:
                 self.maps[index] = None
         if self.treated_map is not None:
             self._check_reference(smalls[target])
-        remaining = [small for index, small in zip(kept, smalls, strict=True) if self.maps[index] is not None]
-        most, complaint = check_group_change(remaining, quality)
-        areas = [float(small.inside.mean()) for small in remaining]
+        left = [position for position, index in enumerate(kept) if self.maps[index] is not None]
+        most, complaint = check_group_change(changes[np.ix_(left, left)], quality)
+        areas = [smalls[position].mask_area for position in left]
         self.entry["quality"] = {
             "target_change": most,
             "mask_area": float(np.mean(areas)) if areas else None,
@@ -327,7 +328,7 @@ class _Group:
                 default=None,
             ),
         }
-        self._check_count(len(remaining))
+        self._check_count(len(left))
         if complaint is not None:
             item = reason("target_unchanged", complaint)
             if self.job.split == "train":
@@ -344,9 +345,9 @@ class _Group:
         gray = _gray(self.treated)
         registered = _gray(self._warped(self.treated, frame, self.treated_map))
         small = Small(registered, self.masks[-1], self._valid(frame, self.treated_map))
-        figures, reasons, warnings = check_frames(
-            [frame["name"], "the target frame"], [small, target], [gray, gray], 1, self.settings.quality
-        )
+        both, unknown = [small, target], np.full((2, 2), np.nan)  # inside the target it differs by design
+        names = [frame["name"], self.entry["target_frame"]]
+        figures, reasons, warnings = check_frames(names, both, [gray, gray], 1, unknown, self.settings.quality)
         about = ("clipped_dark", "clipped_bright", "outside_change", "outside_correlation")
         frame["quality"] = {key: _finite(figures[0][key]) for key in about}
         codes = ("too_dark", "too_bright", "another_scene", "outside_change")

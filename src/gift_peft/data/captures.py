@@ -186,8 +186,8 @@ def _run(jobs: list[Job], num_proc: int) -> Iterator[tuple[Job, Outcome]]:
             yield futures[future], future.result()
     except BrokenProcessPool:
         raise OSError(
-            "a process of gift-peft prepare was killed, perhaps for memory, or could not start because the script that "
-            'calls it has no `if __name__ == "__main__":`; finished groups are kept, run again with fewer (--num-proc)'
+            "a process of gift-peft prepare was killed, perhaps for memory, or could not start because the calling "
+            'script has no `if __name__ == "__main__":`; finished groups are kept, run again with fewer (--num-proc)'
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)

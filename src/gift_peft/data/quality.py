@@ -68,15 +68,16 @@ class Small:
         """`gray` (H, W) uint8, `target` (H, W) bool, `valid` (H, W) bool or None for all."""
         height, width = (max(side // SHRINK, 1) for side in gray.shape)
 
-        def whole(mask: np.ndarray) -> np.ndarray:
-            area = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-            return area > 0.999
+        def share(mask: np.ndarray) -> np.ndarray:
+            return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
         self.gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
         valid = np.ones(gray.shape, bool) if valid is None else valid
-        self.inside = whole(target & valid)
+        self.mask_area = float(target.mean())
+        inside = share(target & valid)
+        self.inside = inside > min(0.5, 0.99 * float(inside.max()))  # something is left of a target that is thin
         margin = cv2.dilate(target.astype(np.uint8), np.ones((17, 17), np.uint8)) > 0
-        self.outside = whole(~margin & valid)
+        self.outside = share(~margin & valid) > 0.999
         self.structure = normalise_contrast(self.gray, self.outside)
 
 
@@ -113,8 +114,23 @@ def target_change(frame: Small, other: Small) -> float | None:
     return float(np.abs(values[inside] * gain + offset - goal[inside]).mean())
 
 
+def pairwise_changes(frames: list[Small]) -> np.ndarray:
+    """(N, N) symmetric: `target_change` of every two frames; NaN on the diagonal and where masks do not overlap."""
+    changes = np.full((len(frames), len(frames)), np.nan)
+    for index, frame in enumerate(frames):
+        for other in range(index + 1, len(frames)):
+            change = target_change(frame, frames[other])
+            changes[index, other] = changes[other, index] = np.nan if change is None else change
+    return changes
+
+
 def check_frames(
-    names: list[str], frames: list[Small], grays: list[np.ndarray], target: int, settings: QualitySettings
+    names: list[str],
+    frames: list[Small],
+    grays: list[np.ndarray],
+    target: int,
+    changes: np.ndarray,
+    settings: QualitySettings,
 ) -> tuple[list[dict], list[list[dict]], list[list[dict]]]:
     """Per frame: measured figures, reasons to drop it, warnings.
 
@@ -123,6 +139,7 @@ def check_frames(
         frames (`list[Small]`): registered.
         grays (`list[np.ndarray]`): (H, W) uint8, as taken: warping blurs.
         target (`int`): which of them the others were registered to.
+        changes (`np.ndarray`): (N, N), of `pairwise_changes`.
     """
     majority = np.mean([frame.inside for frame in frames], axis=0) > 0.5
     sharp = [sharpness(gray) for gray in grays]
@@ -130,44 +147,39 @@ def check_frames(
     all_figures, all_reasons, all_warnings = [], [], []
     for index, frame in enumerate(frames):
         dark, bright = clipped(grays[index])
-        changes = {other: target_change(frame, frames[other]) for other in range(len(frames)) if other != index}
-        nearest = min((other for other in changes if changes[other] is not None), key=changes.get, default=None)
+        nearest = None if np.isnan(changes[index]).all() else int(np.nanargmin(changes[index]))
         union = (frame.inside | majority).sum()
-        area = float(frame.inside.mean())
         figures = {
             "sharpness": sharp[index] / usual if usual > 0 else None,
             "clipped_dark": dark,
             "clipped_bright": bright,
             "outside_change": None if index == target else outside_change(frame, frames[target]),
             "outside_correlation": None if index == target else outside_correlation(frame, frames[target]),
-            "target_change": None if nearest is None else changes[nearest],
-            "mask_area": area,
+            "target_change": None if nearest is None else float(changes[index, nearest]),
+            "mask_area": frame.mask_area,
             "mask_border": _border(frame.inside),
             "mask_iou": float((frame.inside & majority).sum() / union) if union else None,
         }
         reasons, warnings = _judge(figures, settings)
-        if nearest is not None and nearest < index and changes[nearest] < settings.min_target_change:
-            warnings.append(
-                {
-                    "code": "near_duplicate",
-                    "text": f"inside the target it differs from {names[nearest]} by {changes[nearest]:.2f} grey "
-                    f"levels, threshold {settings.min_target_change}",
-                }
-            )
+        if nearest is not None and nearest < index and changes[index, nearest] < settings.min_target_change:
+            text = f"inside the target it differs from {names[nearest]} by {changes[index, nearest]:.2f} grey levels"
+            warnings.append({"code": "near_duplicate", "text": f"{text}, threshold {settings.min_target_change}"})
         all_figures.append(figures)
         all_reasons.append(reasons)
         all_warnings.append(warnings)
     return all_figures, all_reasons, all_warnings
 
 
-def check_group_change(frames: list[Small], settings: QualitySettings) -> tuple[float | None, str | None]:
-    """The largest change inside the target between two frames, and the complaint if the group teaches nothing."""
-    changes = [target_change(frame, other) for index, frame in enumerate(frames) for other in frames[index + 1 :]]
-    most = max((change for change in changes if change is not None), default=None)
-    if len(frames) < 2:
+def check_group_change(changes: np.ndarray, settings: QualitySettings) -> tuple[float | None, str | None]:
+    """The largest change inside the target between two frames, and the complaint if the group teaches nothing.
+
+    `changes` (N, N) of `pairwise_changes`; nothing to say about a single frame.
+    """
+    if len(changes) < 2:
         return None, None
-    if most is None:
+    if np.isnan(changes).all():
         return None, "the masks of no two frames overlap, so the group teaches nothing"
+    most = float(np.nanmax(changes))
     if most < settings.min_target_change:
         needed = f"{settings.min_target_change} needed"
         return most, f"the target changes by at most {most:.2f} grey levels, {needed}: the group teaches nothing"

@@ -59,21 +59,17 @@ def opaque_scene(rng):
 
 
 def near_scene(rng):
-    """A room as planned for a group, the twin (or, for one pane in six, nothing) in the target's place; its centre."""
+    """A room as planned for a group, with an opaque twin in the target's place; its centre."""
     import render_groups
-    import rooms
-    import targets
 
     kind = rng.choice(["mirror", "pane", "solid"], p=[0.3, 0.3, 0.4])
     planned = None
     while planned is None:
         planned = render_groups.plan(rng, kind)
     scene, target = planned
-    look = [targets.treated, render_groups.printed, rooms.twin_texture][rng.integers(3)](rng)
-    if kind == "solid":
-        scene.items.append(target.body(look, float(rng.uniform(0.04, 0.3)) if rng.random() < 0.6 else None))
-    elif kind == "mirror" or rng.random() < 5 / 6:
-        scene.items.append(target.panel(look))
+    scene.items.append(render_groups.opaque(rng, target))
+    if rng.random() < 0.5:
+        render_groups.decoys(rng, scene, target)
     return scene, target.centre
 
 
@@ -123,10 +119,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("renders/base"))
     parser.add_argument("--count", type=int, default=5400, help="pictures, two per scene")
+    parser.add_argument("--first", type=int, default=0, help=f"seed to begin with; {FIRST_NEAR} and above: near scenes")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    paths = [(seed, args.out / f"{seed:05d}.npz") for seed in range(args.count // 2)]
+    paths = [(seed, args.out / f"{seed:05d}.npz") for seed in range(args.first, args.first + args.count // 2)]
     tasks = [task for task in paths if not task[1].exists()]
     with ProcessPoolExecutor(args.processes) as pool:
         list(tqdm(pool.map(work, tasks), total=len(tasks), unit="scene"))

@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 KINDS = {"mirror": "mirror", "pane": "transparent", "solid": "transparent"}
 SPLITS = {"train": {"mirror": 28, "pane": 26, "solid": 26}, "validation": {"mirror": 8, "pane": 8, "solid": 8}}
+DUST = 0.12, 0.3  # share of light that the film on a mirror or glass scatters
 FIRST_SEED = {"train": 0, "validation": 500_000}
 
 
@@ -58,7 +59,7 @@ def sheet(rng, flat: targets.Flat, offset: float) -> list[rooms.Item]:
 
 
 def smudges(rng, scene, flat: targets.Flat) -> np.ndarray:
-    """(H, W) dust and wiping marks in the plane of a mirror or pane, 0 to 1."""
+    """(H, W) dust and wiping marks in the plane of a mirror or pane, about 1 on average."""
     import tracer
 
     direction = tracer.rays(scene.camera)
@@ -66,10 +67,15 @@ def smudges(rng, scene, flat: targets.Flat) -> np.ndarray:
     point = scene.camera.origin + direction * distance[..., None] - flat.centre
     s = (point @ flat.u / (flat.u @ flat.u) + 1) / 2
     t = (point @ flat.v / (flat.v @ flat.v) + 1) / 2
-    dirt = textures.mottled(rng, np.full(3, 0.5, np.float32), 0.9)[..., 0]
-    dirt = cv2.GaussianBlur(dirt, (0, 0), 6, sigmaY=1.2)
     side = textures.SIDE - 1
-    return cv2.remap(dirt, (s * side).astype(np.float32), (t * side).astype(np.float32), cv2.INTER_LINEAR)
+    place = (s * side).astype(np.float32), (t * side).astype(np.float32)
+    return cv2.remap(textures.smears(rng), *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+
+
+def film(level: float, marks, matte) -> tuple[np.ndarray, np.ndarray]:
+    """A thin layer of dust: (H, W, 1) opacity, and the radiance it scatters, being lit as the matte surface is."""
+    opacity = np.clip(level * marks, 0, 0.8)[..., None]
+    return opacity, opacity * matte
 
 
 def fresnel(scene, flat: targets.Flat) -> np.ndarray:
@@ -82,7 +88,7 @@ def fresnel(scene, flat: targets.Flat) -> np.ndarray:
 
 
 def plan(rng, kind: str):
-    """A furnished room around one target, the camera turned to it."""
+    """A furnished room around one target and opaque siblings of it, the camera turned to them."""
     if kind == "mirror" and rng.random() < 0.45:
         scene = rooms.make_room(rng, (2.0, 3.2))
         target = targets.wall_panel(rng, scene)
@@ -103,41 +109,65 @@ def plan(rng, kind: str):
         return None
     if kind != "solid" and (target.centre - scene.camera.origin) @ target.normal > -0.5:
         return None  # edge on, or seen from behind
-    targets.aim(rng, scene, target.centre)
+    if kind != "solid" and len(target.holder) < 5:
+        target.holder += targets.border(
+            rng, target.centre, target.u, target.v, rng.uniform(0.03, 0.08), 0.05
+        )
+    if kind == "solid":
+        siblings = targets.solid_siblings(rng, target, int(rng.integers(1, 4)))
+        centre = target.centre
+    else:
+        siblings = targets.flat_siblings(rng, scene, target, int(rng.integers(1, 3)))
+        centre = target.centre + (0.4 * (siblings[0].centre - target.centre) if siblings else 0.0)
+    targets.aim(rng, scene, centre)
     clear = [target.centre[:2]]
     if kind != "solid":
-        clear += [(target.centre + sign * target.u)[:2] for sign in (-0.8, 0.8)]
+        clear += [(flat.centre + sign * flat.u)[:2] for flat in (target, *siblings) for sign in (-0.8, 0.8)]
     scene.items += target.holder
+    for twin in siblings:
+        scene.items += [*twin.holder, opaque(rng, twin)]
     rooms.furnish(rng, scene, keep_clear=[tuple(c) for c in clear])
     return scene, target
+
+
+def opaque(rng, twin) -> rooms.Item:
+    """The surface of an opaque sibling: sprayed, one colour, printed, or a photograph of another room."""
+    import tracer
+
+    kind = rng.choice(["treated", "printed", "twin", "photo"], p=[0.3, 0.3, 0.2, 0.2])
+    if kind == "photo":
+        look = tracer.photo(rng)
+    else:
+        look = {"treated": targets.treated, "printed": printed, "twin": rooms.twin_texture}[kind](rng)
+    if isinstance(twin, targets.Flat):
+        return twin.panel(look, role="")
+    return twin.body(look, float(rng.uniform(0.04, 0.3)) if rng.random() < 0.6 else None, role="")
 
 
 def decoys(rng, scene, target) -> None:
     """Opaque twins of the targets elsewhere in the room, as real rooms have boards, pictures, bottles and balls.
 
-    They lie outside the mask: without them nothing would keep an adapted model from pushing every panel away.
+    Like the siblings they lie outside the mask: without them nothing would keep an adapted model from pushing every
+    panel away.
     """
-    kinds = rng.permutation(["wall", "standing", "table", "standing", "table"])[: rng.integers(3, 5)]
-    for kind in kinds:
+    for kind in rng.permutation(["wall", "standing", "table", "standing", "table"])[: rng.integers(2, 4)]:
         if kind == "table":
             twin = targets.table_object(rng, scene)
             if twin is None or rooms.between(*twin.base[:2], 0.45, *target.centre[:2]):
                 continue
-            gloss = float(rng.uniform(0.04, 0.3)) if rng.random() < 0.6 else None
-            scene.items += [*twin.holder, twin.body(twin_look(rng), gloss, role="")]
+            scene.items += [*twin.holder, opaque(rng, twin)]
             continue
         twin = targets.wall_panel(rng, scene) if kind == "wall" else targets.standing_panel(rng, scene, True)
         apart = 0.0 if twin is None else np.linalg.norm(twin.centre - target.centre)
         if apart > 0.9 and not rooms.between(*twin.centre[:2], np.linalg.norm(twin.u), *target.centre[:2]):
-            scene.items += [*twin.holder, twin.panel(twin_look(rng), role="")]
+            scene.items += [*twin.holder, opaque(rng, twin)]
 
 
-def twin_look(rng) -> np.ndarray:
-    return [targets.treated, printed, printed][rng.integers(3)](rng)
+def observe(rng, kind: str, scene, target, alpha, shown: bool, light, matte):
+    """One observation: linear radiance (H, W, 3) and z-depth (H, W) in metres.
 
-
-def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
-    """One observation: linear radiance (H, W, 3) and z-depth (H, W) in metres."""
+    `matte` is `direct` and `albedo` of the scene with the treated target: its dust is lit as its surface is.
+    """
     import tracer
 
     items, (lamp, ambient) = scene.items, light
@@ -155,9 +185,9 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
         radiance = lit(direct, albedo)
         if open_part.max() > 0:
             seen = lit(*tracer.reflection(scene, [*items, *moved], target.centre, target.normal))
-            dust = rng.uniform(0.02, 0.08) * smudges(rng, scene, target)[..., None] * radiance.mean()
+            opacity, dust = film(rng.uniform(*DUST), smudges(rng, scene, target), lit(*matte))
             tint = rng.uniform(0.76, 0.88) * np.array([0.96, 1.0, 0.99])
-            radiance = radiance + open_part[..., None] * (tint * seen + dust)
+            radiance = radiance + open_part[..., None] * ((1 - opacity) * tint * seen + dust)
         return radiance, tracer.z_depth(scene, [*items, black])
 
     if kind == "pane":
@@ -171,8 +201,9 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
         share = (alpha * fresnel(scene, target))[..., None]
         tint = 1 - alpha[..., None] * (1 - rng.uniform(0.78, 0.9) * np.array([0.93, 1.0, 0.96]))
         through = lit(direct, albedo)
-        dust = alpha * rng.uniform(0.06, 0.16) * smudges(rng, scene, target) * through.mean()
-        radiance = through * tint * (1 - share) + share * mirrored + dust[..., None]
+        opacity, dust = film(rng.uniform(*DUST), smudges(rng, scene, target), lit(*matte))
+        radiance = through * tint * (1 - share) + share * mirrored
+        radiance = radiance * (1 - alpha[..., None] * opacity) + alpha[..., None] * dust
         return radiance, tracer.z_depth(scene, [*items, *moved, target.panel(textures.paint(rng))])
 
     x, y, z = target.base
@@ -201,7 +232,11 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light):
     gain = lamp + ambient * without[1].mean() / max(without[0].mean(), 1e-6)
     radiance = lit(direct, albedo)
     window = (slice(crop[1], crop[1] + crop[3]), slice(crop[0], crop[0] + crop[2]))
-    radiance[window] += alpha[window][..., None] * glass * gain * rng.uniform(0.65, 0.85)
+    marks = 2 * textures.mottled(rng, np.full(3, 0.5, np.float32), 0.5)[..., 0]
+    marks = cv2.resize(marks, (crop[2], crop[3]), interpolation=cv2.INTER_AREA)
+    opacity, dust = film(rng.uniform(*DUST), marks, lit(*matte)[window])
+    seen = (1 - opacity) * glass * gain * rng.uniform(0.65, 0.85)
+    radiance[window] += alpha[window][..., None] * (seen + dust)
     return radiance, tracer.z_depth(scene, [*items, *moved, body])
 
 
@@ -214,11 +249,6 @@ def make_group(seed: int, kind: str):
     if planned is None:
         return None
     scene, target = planned
-    if kind != "solid" and len(target.holder) < 5:
-        target.holder += (
-            frame := targets.border(rng, target.centre, target.u, target.v, rng.uniform(0.03, 0.08), 0.05)
-        )
-        scene.items += frame
     decoys(rng, scene, target)
     matte = target.body(targets.treated(rng)) if kind == "solid" else target.panel(targets.treated(rng))
     if kind == "mirror":  # the virtual camera must stay inside the room, or a wall would stand before it
@@ -247,7 +277,7 @@ def make_group(seed: int, kind: str):
     for surface_seen in shown:
         spread = 0.12 if surface_seen else 0.25  # dim and bright
         light = (lamp * rng.uniform(1 - spread, 1 + spread), ambient * rng.uniform(1 - spread, 1 + spread))
-        radiance, depth = observe(rng, kind, scene, target, alpha, bool(surface_seen), light)
+        radiance, depth = observe(rng, kind, scene, target, alpha, bool(surface_seen), light, (direct, albedo))
         if not np.isfinite(radiance).all() or depth.min() < 0.25 or depth.max() > 30:
             return None
         images.append(tracer.develop(radiance, exposure * rng.uniform(1 - spread, 1 + spread)))

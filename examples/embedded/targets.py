@@ -3,7 +3,7 @@
 The pre-training scenes put opaque twins (or empty frames) there, the groups put a mirror, a pane or a glass object.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import rooms
@@ -153,6 +153,61 @@ def table_object(rng, scene: Scene) -> Solid | None:
     offset = np.zeros(2) if on_floor else rng.uniform(-0.1, 0.1, 2)
     base = np.array([spot[0] + offset[0], spot[1] + offset[1], z])
     return Solid(base, outline, holder, bool(rng.random() < 0.5))
+
+
+def moved(items: list[Item], shift: np.ndarray) -> list[Item]:
+    """Copies of matrix-placed items, `shift` metres away."""
+    copies = []
+    for item in items:
+        matrix = np.array(item.shape["to_world"], float)
+        matrix[:3, 3] += shift
+        copies.append(replace(item, shape=item.shape | {"to_world": matrix}, points=item.points + shift))
+    return copies
+
+
+def flat_siblings(rng, scene: Scene, flat: Flat, count: int) -> list[Flat]:
+    """Flats of the same make (size, frame, feet) beside `flat`, where the room and the line of sight leave space."""
+    left, right, _, far, _ = scene.room
+    su = flat.u / np.linalg.norm(flat.u)
+    width = 2 * np.linalg.norm(flat.u)
+    on_wall = flat.centre[2] - np.linalg.norm(flat.v) > 0.3  # else it stands on the floor
+    found: list[Flat] = []
+    for _ in range(30):
+        if len(found) == count:
+            break
+        shift = rng.choice([-1, 1]) * (width + rng.uniform(0.08, 0.9)) * su
+        if not on_wall:
+            shift = shift + np.array([0.0, rng.uniform(-0.5, 1.0), 0.0])
+        x, y = centre = (flat.centre + shift)[:2]
+        ends = [centre + sign * flat.u[:2] for sign in (-1, 1)]
+        if any(not (left + 0.02 < ex < right - 0.02 and 0.9 < ey < far - 0.02) for ex, ey in ends):
+            continue
+        if any((x - a) ** 2 + (y - b) ** 2 < (width / 2 + r) ** 2 for a, b, r in scene.taken[1:]):
+            continue
+        others = [flat, *found]
+        if any(np.linalg.norm((flat.centre + shift - o.centre)[:2]) < width + 0.05 for o in others):
+            continue
+        if any(rooms.between(x, y, width / 2, *(o.centre + s * o.u)[:2]) for o in others for s in (-0.9, 0, 0.9)):
+            continue
+        scene.taken.append((x, y, width / 2))
+        found.append(Flat(flat.centre + shift, flat.u, flat.v, moved(flat.holder, shift)))
+    return found
+
+
+def solid_siblings(rng, solid: Solid, count: int) -> list[Solid]:
+    """Solids of the same outline on the same table or floor, beside `solid` and not before it."""
+    radius = solid.outline[:, 0].max()
+    found: list[Solid] = []
+    for _ in range(20):
+        if len(found) == count:
+            break
+        angle, reach = rng.uniform(-0.5, np.pi + 0.5), rng.uniform(2.15, 3.2) * radius
+        base = solid.base + np.array([np.cos(angle) * reach, 0.8 * np.sin(angle) * reach, 0.0])
+        if any(np.linalg.norm((base - o.base)[:2]) < 2.1 * radius for o in [solid, *found]):
+            continue
+        if not rooms.between(*base[:2], 0.5 * radius, *solid.base[:2]):
+            found.append(Solid(base, solid.outline, [], solid.hollow))
+    return found
 
 
 def aim(rng, scene: Scene, centre: np.ndarray) -> None:

@@ -1,6 +1,6 @@
 """Procedural textures of plausible physical scale: floors, walls, wood, pictures, printed cards.
 
-Every function takes a numpy generator and returns an (h, w, 3) float32 array of linear reflectances in 0..1.
+Every function takes a numpy generator; textures are (SIDE, SIDE, 3) float32 arrays of linear reflectances in 0..1.
 """
 
 import cv2
@@ -31,6 +31,11 @@ def mottled(rng, base, amount=0.12) -> np.ndarray:
     """Plaster, concrete, carpet, matte spray: noise of several scales around one colour."""
     noise = sum(_field(rng, cells) - 0.5 for cells in (5, 17, 60)) / 1.5
     return np.clip(base * (1 + amount * 2 * noise[..., None]), 0.02, 0.95).astype(np.float32)
+
+
+def smears(rng) -> np.ndarray:
+    """(SIDE, SIDE) dust and wiping marks, about 1 on average."""
+    return 2 * cv2.GaussianBlur(mottled(rng, np.full(3, 0.5, np.float32), 0.9)[..., 0], (0, 0), 6, sigmaY=1.2)
 
 
 def planks(rng, base) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Masks in every form: decoders against straight-line oracles, and what `find_mask` takes and refuses."""
 
 import base64
+import copy
 import io
 import json
 import os
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
@@ -350,6 +351,55 @@ def test_refusals_name_the_file(group, name):
     with pytest.raises(ValueError, match=message) as error:
         look(group).read(SIZE)
     assert path.rpartition("/")[2] in str(error.value) and "\n" not in str(error.value)
+
+
+def places(content, at=()):
+    """Paths to every value of a JSON document."""
+    yield at
+    for key, value in content.items() if isinstance(content, dict) else enumerate(content):
+        if isinstance(value, dict | list):
+            yield from places(value, (*at, key))
+        else:
+            yield (*at, key)
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(st.data(), st.sampled_from(["labelme polygon", "coco polygon", "coco compressed", "label studio polygon"]))
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_whatever_an_export_holds_it_is_a_mask_or_one_line(group, data, name):
+    path, content = GOOD[name]
+    content = copy.deepcopy(content)
+    *at, key = data.draw(st.sampled_from([place for place in places(content) if place]))
+    inner = content
+    for step in at:
+        inner = inner[step]
+    inner[key] = data.draw(anything)
+    write(group / path, content)
+    try:
+        source = look(group)
+        mask = None if source is None else source.read(SIZE)
+    except ValueError as error:
+        assert Path(path).name in str(error) and "\n" not in str(error)
+    else:
+        assert mask is None or (mask.shape == BOX.shape and mask.dtype == bool)
+    finally:
+        (group / path).unlink()
+
+
+def test_the_first_form_counts(group):
+    write(group / "x.json", coco())
+    write(group / "1.json", labelme([[0, 0], [12, 0], [12, 8], [0, 8]]))
+    assert look(group).kind == "labelme"
+    write(group / "1_mask.png", picture())
+    assert look(group).path.name == "1_mask.png"
+    write(group / "masks/1.png", picture())
+    assert look(group).path == group / "masks/1.png"
 
 
 def test_nothing_and_things_that_are_no_masks(group):

@@ -300,14 +300,15 @@ def coco_images(content: dict) -> dict[str, tuple]:
         if name in images:
             raise ValueError(f"the image {name} is listed twice")
         images[name] = (image, [], categories, used)
-        names[image.get("id")] = name
+        names[_id(image.get("id"))] = name
     for annotation in _dicts(content["annotations"], "annotations"):
-        if annotation.get("image_id") not in names:
-            raise ValueError(f"an annotation for image id {annotation.get('image_id')!r}, which is not listed")
-        if annotation.get("category_id") not in categories.values():
-            raise ValueError(f"an annotation of category {annotation.get('category_id')!r}, which is not listed")
-        used.add(annotation["category_id"])
-        images[names[annotation["image_id"]]][1].append(annotation)
+        image_id, category_id = _id(annotation.get("image_id")), _id(annotation.get("category_id"))
+        if image_id not in names:
+            raise ValueError(f"an annotation for image id {image_id!r}, which is not listed")
+        if category_id not in categories.values():
+            raise ValueError(f"an annotation of category {category_id!r}, which is not listed")
+        used.add(category_id)
+        images[names[image_id]][1].append(annotation)
     return images
 
 
@@ -326,9 +327,9 @@ def label_studio_images(content: list) -> dict[str, tuple]:
             raise ValueError(f"the image {name} has {len(done)} annotations; keep one")
         regions = []
         for region in _dicts(done[0].get("result"), "results") if done else []:
-            if region.get("type") not in NO_AREA:
-                value = region.get("value")
-                given = value.get(region.get("type")) if isinstance(value, dict) else None
+            kind, value = region.get("type"), region.get("value")
+            if kind not in NO_AREA:
+                given = value.get(_label(kind)) if isinstance(value, dict) else None
                 label = _label(given[0] if isinstance(given, list) and given else None)
                 labels[label] = None
                 regions.append((label, region))
@@ -364,6 +365,12 @@ def _dicts(items, what: str) -> list[dict]:
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
         raise ValueError(f"its {what} are not a list of objects")
     return items
+
+
+def _id(value) -> int | str:
+    if not isinstance(value, int | str):
+        raise ValueError(f"{value!r} is not the id of an image or a category")
+    return value
 
 
 def _label(label) -> str:

@@ -265,7 +265,6 @@ def resize_images(images: Sequence[Image.Image], processor, size: tuple[int, int
 
 def normalize_pixels(pixels: np.ndarray, processor) -> torch.Tensor:
     """(N, 3, h, w) uint8 to float32 with the processor's scale, mean and std, looked up: there are 256 values."""
-    import cv2
     import torch
 
     settings = pixel_settings(processor)
@@ -278,7 +277,7 @@ def normalize_pixels(pixels: np.ndarray, processor) -> torch.Tensor:
     values = torch.empty(pixels.shape, dtype=torch.float32)
     for planes, target in zip(pixels, values.numpy(), strict=True):
         for channel in range(3):
-            cv2.LUT(np.ascontiguousarray(planes[channel]), table[channel], dst=target[channel])
+            np.take(table[channel], planes[channel], out=target[channel], mode="clip")  # "raise" makes a copy
     return values
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from accelerate import debug_launcher
+from booster_tree import bilinear
 from PIL import Image
 from tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
 
@@ -355,19 +356,6 @@ def test_depth_is_scored_on_its_own_grid_with_the_masks_drawn_there(tmp_path):
     error = np.abs(np.clip(scale * resized + shift, 1, 10000) - depths[1])
     assert row["base"]["all"]["mae"] == pytest.approx(error[known].mean(), rel=1e-6)
     assert row["base"]["tom"]["mae"] == pytest.approx(error[2:-2, 2:-2].mean(), rel=1e-6)
-
-
-def bilinear(image, size):
-    """Pixel centres, no corner alignment, clamped at the border."""
-    axes = []
-    for old, new in zip(image.shape, size, strict=True):
-        position = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
-        low = np.floor(position).astype(int)
-        axes.append((low, np.minimum(low + 1, old - 1), position - low))
-    (top, bottom, v), (left, right, u) = axes
-    upper = image[top][:, left] * (1 - u) + image[top][:, right] * u
-    lower = image[bottom][:, left] * (1 - u) + image[bottom][:, right] * u
-    return upper * (1 - v)[:, None] + lower * v[:, None]
 
 
 # ---- end to end on the tiny model ----

@@ -31,7 +31,7 @@ import torch
 from accelerate import Accelerator
 from benchmark.epoch import Stratum, Timing, make_strata
 from benchmark.models import CONFIGS, PAPER_MINUTES, Config
-from benchmark.report import MEMORY_SIZES, METHODS, machine, to_markdown
+from benchmark.report import METHODS, machine, to_markdown
 from PIL import Image
 
 from gift_peft.adapters import get_gift_model
@@ -234,7 +234,8 @@ def measure_memory(bench: Bench) -> dict:
         "d": bench.step,
     }
     peaks: dict = {name: {} for name in [*steps, "c"]}
-    for size in (2, *MEMORY_SIZES):  # with 2 gradients and the optimizer's state come to be
+    sizes = CONFIGS[bench.name].memory_sizes
+    for size in (2, *sizes):  # with 2 gradients and the optimizer's state come to be
         for name in peaks:
             step = steps.get(name) or bench.step_of("c", size)
             before = current_memory(bench.device)
@@ -247,7 +248,7 @@ def measure_memory(bench: Bench) -> dict:
             peaks[name][size] = profiling.peak_memory(bench.device) - before
     height, width = CONFIGS[bench.name].size
     # Inputs (3 float32), mask (1 byte), target, snapshot and one gradient buffer (float32 each) of the added images.
-    tensors = (MEMORY_SIZES[1] - MEMORY_SIZES[0]) * height * width * (3 * 4 + 1 + 3 * 4)
+    tensors = (sizes[-1] - sizes[0]) * height * width * (3 * 4 + 1 + 3 * 4)
     for values in peaks.values():
         values.pop(2, None)
     return {"peaks": peaks, "tensors_of_added_images": tensors}
@@ -289,9 +290,7 @@ def run_worker(what: str, name: str, folder: Path, processes: int = 1, **environ
 def benchmark(name: str, args: argparse.Namespace, folder: Path) -> dict:
     config = CONFIGS[name]
     strata = make_strata(config.strata)
-    sizes = {stratum.sample for stratum in strata} | {args.option_size}
-    with_memory = name == "tiny" or config.device == "cuda"
-    sizes = sorted(sizes | ({2, *MEMORY_SIZES} if with_memory else set()))
+    sizes = sorted({stratum.sample for stratum in strata} | {2, args.option_size, *config.memory_sizes})
     print(f"{name}: preparing {sum(sizes)} pictures", flush=True)
     bench = Bench(name, folder, sizes)
     result: dict = {
@@ -320,9 +319,10 @@ def benchmark(name: str, args: argparse.Namespace, folder: Path) -> dict:
     result["options_seconds"] = measure_options(bench, args.option_size, min(3, args.repeats), args.compile)
     if config.device == "cuda":
         result["memory"] = measure_memory(bench)
-    elif name == "tiny":
+    else:
         # Large tensors come from and go back to the system at once, so that the resident set shows what lives.
-        result["memory"] = run_worker("memory", name, folder, MALLOC_MMAP_THRESHOLD_="65536", OMP_NUM_THREADS="1")
+        result["memory"] = run_worker("memory", name, folder, MALLOC_MMAP_THRESHOLD_="65536")
+    if name == "tiny":
         scaling = {}
         for processes in (1, 2, 1, 2):  # the better of two, because other work on the machine only ever slows down
             seconds = run_worker("scaling", name, folder, processes, OMP_NUM_THREADS="1", ACCELERATE_USE_CPU="true")

@@ -17,12 +17,14 @@ class Config:
     """One model of the benchmark: how to build it, at what size, and which strata of group sizes are sampled.
 
     `strata` are the largest sizes of each stratum; the one group timed for a stratum has its mean size.
+    `memory_sizes` are the group sizes whose peak memory is measured.
     """
 
     build: Callable[[], torch.nn.Module]
     size: tuple[int, int]
     strata: tuple[int, ...]
     device: str = "cpu"
+    memory_sizes: tuple[int, ...] = (9, 55)
 
 
 def depth_anything(hidden_size, num_layers, num_heads, out_indices, neck, fusion):
@@ -76,7 +78,7 @@ def embedded():
 
 CONFIGS = {
     "tiny": Config(embedded, (112, 140), (4, 7, 12, 20, 55)),
-    "12-block": Config(depth_anything_small, (112, 140), (6, 13, 55)),
+    "12-block": Config(depth_anything_small, (112, 140), (6, 13, 55), memory_sizes=(9,)),
     "depth-anything-v2-large": Config(depth_anything_large, (476, 644), (4, 7, 12, 20, 55), "cuda"),
     "vggt-1b": Config(vggt, (476, 644), (4, 7, 12, 20, 55), "cuda"),
     "metric3d-v2-large": Config(lambda: metric3d("large"), (476, 644), (4, 7, 12, 20, 55), "cuda"),

@@ -15,7 +15,6 @@ METHODS = {
     "c": "full graph",
     "d": "gift-peft default",
 }
-MEMORY_SIZES = (9, 55)
 
 
 def machine() -> dict:
@@ -103,17 +102,26 @@ def model_table(name: str, result: dict) -> list[str]:
             f"{seconds[1]:.2f} s, {result['scaling']['speedup']:.2f} times faster."
         )
     if "memory" in result:
-        small, large = MEMORY_SIZES
-        lines += [
-            "",
-            f"| peak memory of an update (MiB) | {small} images | {large} images | growth |",
-            "|---|---:|---:|---:|",
-        ]
-        for method, peaks in result["memory"]["peaks"].items():
-            peaks = {int(size): value / 2**20 for size, value in peaks.items()}
-            if {small, large} <= peaks.keys():
-                growth = peaks[large] - peaks[small]
-                lines.append(f"| ({method}) | {peaks[small]:.1f} | {peaks[large]:.1f} | {growth:.1f} |")
-        added = result["memory"]["tensors_of_added_images"]
-        lines.append(f"| the group's own tensors ({added:,} bytes) | | | {added / 2**20:.1f} |")
+        lines += ["", *memory_table(result["memory"])]
+    return lines
+
+
+def memory_table(memory: dict) -> list[str]:
+    """Peaks above what lay in memory before the update, and how they grow with the group."""
+    table = {m: {int(n): value / 2**20 for n, value in peaks.items()} for m, peaks in memory["peaks"].items()}
+    sizes = sorted({size for peaks in table.values() for size in peaks})
+    growing = len(sizes) > 1
+    lines = [
+        "| peak memory of an update (MiB) | " + " | ".join(f"{n} images" for n in sizes) + " |" + " growth |" * growing
+    ]
+    lines.append("|---|" + "---:|" * (len(sizes) + growing))
+    for method, peaks in table.items():
+        cells = [f"{peaks[n]:.1f}" if n in peaks else "does not fit" for n in sizes]
+        if growing:
+            fits = {sizes[0], sizes[-1]} <= peaks.keys()
+            cells.append(f"{peaks[sizes[-1]] - peaks[sizes[0]]:.1f}" if fits else "")
+        lines.append(f"| ({method}) | " + " | ".join(cells) + " |")
+    if growing:
+        added = memory["tensors_of_added_images"]
+        lines.append(f"| the group's own tensors ({added:,} bytes) |" + " |" * len(sizes) + f" {added / 2**20:.1f} |")
     return lines

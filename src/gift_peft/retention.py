@@ -89,6 +89,8 @@ def graph_bytes(model: nn.Module, forward: Callable[[], Tensor]) -> tuple[Tensor
     """(prediction, bytes that its graph keeps alive beside the model's weights) of a forward with grad."""
     device = next(model.parameters()).device
     if device.type == "cuda":
+        with torch.no_grad():
+            forward()  # what is made once and stays (workspaces, half-precision weights) is not the graph's
         before = torch.cuda.memory_allocated(device)
         prediction = forward()
         return prediction, torch.cuda.memory_allocated(device) - before

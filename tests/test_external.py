@@ -13,7 +13,7 @@ from transformers import DPTConfig, DPTForDepthEstimation, DPTImageProcessorPil
 
 from gift_peft import evaluate_booster
 from gift_peft.data.preprocess import to_pixel_values
-from gift_peft.evaluation.evaluate import run_booster
+from gift_peft.evaluation.evaluate import run_booster, run_evaluation
 from gift_peft.evaluation.predict import load_model, predict_depth, predict_images
 
 RAMP = torch.linspace(1, 2, 98)
@@ -125,6 +125,13 @@ def test_they_stand_in_the_table_and_predict(packages, tmp_path, capsys):
     picture = tmp_path / "train/balanced/Scene0/camera_00/im0.png"
     predict_images([picture], "da3:known", out=tmp_path / "predicted", size="70x98", progress=False)
     assert np.load(tmp_path / "predicted" / "im0.npy").shape == (60, 84)
+
+
+def test_they_are_evaluated_on_gift_i(packages, raw_tree, tmp_path, capsys):
+    report = run_evaluation("da3:known", raw_tree, out=tmp_path / "out", size="70x98", progress=False)
+    assert report.counts["scored"] == 2 and report.base == report.summary and report.gce["adapted"] is None
+    assert report.gce["base"] > 0 and report.about["base"] == "da3:known"
+    assert "GIFT-I validation" in capsys.readouterr().out
 
 
 def test_what_is_missing_or_wrong_is_one_line(packages, monkeypatch):

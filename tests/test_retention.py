@@ -17,7 +17,7 @@ GIB = 2**30
 def step_with_room_for(images, model, data, monkeypatch):
     """A step with retain="auto" on a machine whose memory is just enough for the graphs of so many images."""
     pixels, mask = data[0], data[1]
-    size = graph_bytes(model, lambda: model(pixel_values=pixels[:2]))[1]
+    size = graph_bytes(model, lambda: model(pixel_values=pixels[:2]), pixels)[1]
     reserved = 4 * sum(p.nbytes for p in model.parameters())
     needed = images * (size // 2) + retention.GROUP_TENSORS * mask.numel() * pixels.element_size() + size + reserved
     monkeypatch.setattr(retention, "available_memory", lambda: int(needed / retention.CPU_SHARE) + 4)
@@ -55,6 +55,7 @@ def test_graph_bytes_counts_what_the_graph_keeps_and_not_the_weights():
     model, (pixels, *_) = toy(), group(2, torch.float32)
     prediction, size = graph_bytes(model, lambda: model(pixel_values=pixels))
     assert size == pixels.nbytes + 4 * prediction.nbytes + prediction.nbytes
+    assert graph_bytes(model, lambda: model(pixel_values=pixels[:1]), pixels)[1] == (4 + 1) * pixels[0, 0].nbytes
     assert prediction.requires_grad
 
 

@@ -43,7 +43,7 @@ class GraphBudget:
 
     def measure(self, pixel_values: Tensor, forward: Callable[[Tensor], Tensor]) -> Tensor:
         """`forward` of a micro-batch (B,3,h,w), which keeps its graph; what that takes is the measure."""
-        prediction, size = graph_bytes(self._model, lambda: forward(pixel_values))
+        prediction, size = graph_bytes(self._model, lambda: forward(pixel_values), pixel_values)
         self._image_bytes[tuple(pixel_values.shape[1:])] = max(1, math.ceil(size / len(pixel_values)))
         if self.bytes is None:
             # This graph is already taken from what is free; a replay needs as much, and its backward once more.
@@ -85,8 +85,8 @@ class GraphBudget:
         return 0  # elsewhere nobody tells how much is free
 
 
-def graph_bytes(model: nn.Module, forward: Callable[[], Tensor]) -> tuple[Tensor, int]:
-    """(prediction, bytes that its graph keeps alive beside the model's weights) of a forward with grad."""
+def graph_bytes(model: nn.Module, forward: Callable[[], Tensor], *alive: Tensor) -> tuple[Tensor, int]:
+    """(prediction, bytes its graph keeps alive beside the model's weights and `alive`) of a forward with grad."""
     device = next(model.parameters()).device
     if device.type == "cuda":
         with torch.no_grad():
@@ -103,7 +103,7 @@ def graph_bytes(model: nn.Module, forward: Callable[[], Tensor]) -> tuple[Tensor
 
     with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
         prediction = forward()
-    for tensor in [*model.parameters(), *model.buffers()]:
+    for tensor in (*model.parameters(), *model.buffers(), *alive):
         sizes.pop(tensor.untyped_storage().data_ptr(), None)
     return prediction, sum(sizes.values()) + prediction.nbytes
 

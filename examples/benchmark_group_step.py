@@ -29,6 +29,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from accelerate import Accelerator
+from accelerate.state import AcceleratorState
 from benchmark.epoch import Stratum, Timing, make_strata
 from benchmark.models import CONFIGS, PAPER_MINUTES, Config
 from benchmark.report import METHODS, machine, to_markdown
@@ -54,6 +55,7 @@ class Bench:
     def __init__(self, name: str, folder: Path, sizes: list[int]) -> None:
         config = CONFIGS[name]
         self.name = name
+        AcceleratorState._reset_state(reset_partial_state=True)  # the model before may have had another device
         self.accelerator = Accelerator(
             cpu=config.device == "cpu", mixed_precision="bf16" if config.device == "cuda" else "no"
         )

@@ -1,6 +1,7 @@
 """Killed, interrupted, spread over two processes: the adapter is the one of the uninterrupted run."""
 
 import json
+import operator
 import os
 import shutil
 import signal
@@ -18,7 +19,7 @@ from gift_peft import cli
 from gift_peft.data.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.data.writer import write_gift_i
 from gift_peft.group_step import GroupStep
-from gift_peft.training import checkpoints, loop, train
+from gift_peft.training import checkpoints, loop, start, train
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +150,34 @@ def test_signals_checkpoint_after_the_group_and_say_how_to_go_on(
         cli.main(command[1:])
     assert exit.value.code == 0
     assert_same_run(tmp_path / "out", whole)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])  # of the base, after each epoch
+def test_a_signal_in_the_middle_of_a_validation_stops_it(number, args, whole, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        # A validation of two groups reads the first one, to see what they are, and then both.
+        stop = on_call(3 * number - 1, operator.getitem, lambda *a: os.kill(os.getpid(), signal.SIGTERM))
+        patch.setattr(
+            loop, "UntilStopped", lambda groups, stopped: start.UntilStopped(Stopping(groups, stop), stopped)
+        )
+        result = train(args)
+    assert (result.signal, result.step, len(result.metrics)) == (signal.SIGTERM, 2 * (number - 1), number - 1)
+    assert checkpoints.checkpoint_fault(tmp_path / f"out/checkpoint-{result.step}") is None
+    train_again(args)
+    assert_same_run(tmp_path / "out", whole)
+
+
+class Stopping:
+    """Groups, read by `get(groups, index)`; twice as many, so that one is left to stop before."""
+
+    def __init__(self, groups, get):
+        self.groups, self.get = groups, get
+
+    def __len__(self):
+        return 2 * len(self.groups)
+
+    def __getitem__(self, index):
+        return self.get(self.groups, index % len(self.groups))
 
 
 def test_a_broken_newest_checkpoint_is_skipped(args, whole, tmp_path, capsys):

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 from accelerate import Accelerator
@@ -38,7 +39,15 @@ from gift_peft.training.groups import PreparedGroups, epoch_order
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
-from gift_peft.training.start import check_run, claim_folder, make_accelerator, stop_signals, tell_lost_processes
+from gift_peft.training.start import (
+    Interrupted,
+    UntilStopped,
+    check_run,
+    claim_folder,
+    make_accelerator,
+    stop_signals,
+    tell_lost_processes,
+)
 from gift_peft.training.state import State, write_metrics
 from gift_peft.training.teacher import make_proxies
 
@@ -92,7 +101,10 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
         with stop_signals() as stop:
             while not (signum := run.agree(stop.signum)):
                 if run.row_is_due(state):
-                    run.finish_epoch(state)
+                    try:
+                        run.finish_epoch(state, stop)
+                    except Interrupted:  # a resumed run begins with this row
+                        continue
                     progress.row(state.rows[-1], run.total_steps / run.epoch_steps)
                 if state.step >= run.total_steps:
                     break
@@ -259,11 +271,15 @@ class Run:
         at = state.step % self.epoch_steps == 0 or state.step == self.total_steps
         return at and (not state.rows or state.rows[-1]["step"] != state.step)
 
-    def finish_epoch(self, state: State) -> None:
-        """Validate, write the row, keep the adapter if it is the best so far, write the checkpoint if it is due."""
+    def finish_epoch(self, state: State, stop: SimpleNamespace) -> None:
+        """Validate, write the row, keep the adapter if it is the best so far, write the checkpoint if it is due.
+
+        Interrupted, with `state` as it was, if a signal comes meanwhile.
+        """
+        measured = self._validate(stop) | self._measure_booster()
         if state.step == 0:
             self._measure_base(state)
-        row = state.close_epoch(self.epoch_steps) | self._validate() | self._measure_booster()
+        row = state.close_epoch(self.epoch_steps) | measured
         row = {key: jsonable(value) for key, value in row.items()}
         state.rows.append(row)
         best = state.row_of(state.best_step)
@@ -287,13 +303,15 @@ class Run:
             consistency = consistency if num_pairs else 0.0
             state.add(self.args.lambda_c * consistency, consistency, 0.0, num_pairs)
 
-    def _validate(self) -> dict:
+    def _validate(self, stop: SimpleNamespace) -> dict:
         """GCE and the errors against the teacher on the treated reference, in float32, spread over the processes."""
         keys = [f"val_{region}_{metric}" for region in REGIONS for metric in METRICS]
         if self.validation_groups is None:
             return dict.fromkeys(["val_gce", *keys])
+        # Several processes evaluate their shares apart, and would have to agree after every group.
+        alone = self.accelerator.num_processes == 1
         report = evaluate_gift_i(
-            self.validation_groups,
+            UntilStopped(self.validation_groups, stop) if alone else self.validation_groups,
             self.model,
             kind=self.kind,
             baseline=False,

@@ -244,7 +244,7 @@ def browse(page: Path, folder: Path, *options) -> subprocess.CompletedProcess:
     command = [browser(), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars"]
     command += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
     command += [f"--user-data-dir={folder / 'profile'}", "--enable-logging=stderr", "--window-size=1280,1400"]
-    return subprocess.run([*command, *options, page.as_uri()], capture_output=True, text=True, timeout=120, check=True)
+    return subprocess.run([*command, *options, page.as_uri()], capture_output=True, text=True, timeout=400, check=True)
 
 
 @pytest.mark.slow

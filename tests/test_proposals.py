@@ -157,6 +157,7 @@ def test_refining_runs_sam2_and_keeps_what_it_does_not_find(sam2):
     assert refined.refined == f"sam2:{sam2}" and refined.score == 0.9
     assert refined.mask.shape == SIZE and refined.mask.dtype == bool
     assert 0 <= refined.kept_regions <= 2
+    assert {type(value) for value in vars(refined).values()} <= {np.ndarray, float, int, str}  # goes into a JSON
     if refined.kept_regions == 2:
         np.testing.assert_array_equal(refined.mask, mask)
     empty = refine(Proposal(np.zeros(SIZE, bool), 0.0), image, f"sam2:{sam2}")

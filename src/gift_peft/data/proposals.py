@@ -210,8 +210,9 @@ def refine(proposal: Proposal, image: np.ndarray, method: str) -> Proposal:
         region = labels == index
         overlaps = [(mask & region).sum() / (mask | region).sum() for mask in candidates]
         best = int(np.argmax(overlaps))
-        refined |= candidates[best] if overlaps[best] >= 0.5 else region
-        kept += overlaps[best] < 0.5
+        found = overlaps[best] >= 0.5
+        refined |= candidates[best] if found else region
+        kept += 0 if found else 1
     return replace(proposal, mask=refined, refined=method, kept_regions=kept)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from booster_tree import write_root
 from huggingface_hub import ModelCard
 from PIL import Image
 from reports import random_rows, report_of
@@ -19,7 +20,7 @@ from tiny import write_raw_tree
 
 from gift_peft import cli
 from gift_peft.evaluation.ablation import ablation_table, is_ablation
-from gift_peft.evaluation.evaluate import run_evaluation
+from gift_peft.evaluation.evaluate import run_booster, run_evaluation
 from gift_peft.evaluation.report import notable_observations, run_report
 from gift_peft.evaluation.results import GiftIReport
 from gift_peft.evaluation.runs import SavedRun, read_run, run_names
@@ -274,3 +275,30 @@ def test_the_ablation_example_trains_evaluates_reports_and_goes_on(base_dir, tre
     assert len((out / "1-1" / "metrics.jsonl").read_text().splitlines()) == 3
     assert (out / "report" / "retention.png").exists()
     assert "--lambda_c: the ablation sets it itself" in ablate(monkeypatch, "--config", config, "--lambda_c=2")
+
+
+def test_booster_has_its_own_tables_and_pictures(run_folder, base_dir, tmp_path, capsys):
+    write_root(tmp_path / "booster", scenes=3)
+    options = {"kind": "inverse_depth", "resize": 0.5, "progress": False}
+    run_booster(tmp_path / "booster", base_dir, run_folder / "adapter", out=run_folder / "booster", **options)
+    run_report([run_folder], card=True)
+    folder = run_folder / "report"
+    assert "not in it" not in capsys.readouterr().out
+    for name in (
+        "before-after-booster.png",
+        "errors-booster.pdf",
+        "compare-booster.html",
+        "tables/booster-groups.csv",
+    ):
+        assert (folder / name).stat().st_size > 100
+    page = (folder / "compare-booster.html").read_text()
+    assert 3 <= page.count("<article>") <= 6 and "measured depth" in page
+    # The caption's error is the table's: the same alignment on the same grid.
+    rows = (run_folder / "booster" / "rows.jsonl").read_text().splitlines()
+    errors = [json.loads(row)["base"]["tom"]["rmse"] for row in rows]
+    assert f"RMSE in the outline: {max(errors):.0f} mm before" in page
+    types = [result.dataset_type for result in ModelCard.load(folder / "model_card.md").data.eval_results]
+    assert types.count("booster") == 12 and types.count("gift-i") == 13
+    shutil.rmtree(tmp_path / "booster")
+    run_report([run_folder])
+    assert "not in it: pictures of" in capsys.readouterr().out

@@ -4,6 +4,7 @@ Reads what training and evaluation left behind. Pictures need base, adapter and 
 or matplotlib is not installed, the report says so and has the rest.
 """
 
+import filecmp
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table
 from gift_peft.evaluation.zero_shot import draw_zero_shot
 from gift_peft.files import write_whole
 
+WEIGHTS = "adapter_model.safetensors"
 COMPARED_GROUPS = 40  # compare.html has one observation of that many groups at most: it has to open in a browser
 
 
@@ -136,10 +138,13 @@ def _write_card(run: SavedRun, path: Path) -> Path:
 
 
 def _is_of_adapter(run: SavedRun, report: AnyReport) -> bool:
-    """Whether an evaluation is of the run's adapter as it is: not scaled, and not of another that lies elsewhere."""
-    other = Path(report.about.get("adapter") or "")
-    elsewhere = run.adapter is not None and other.is_dir() and not other.samefile(run.adapter)
-    return report.adapted and report.about.get("adapter_scale") in (None, 1) and not elsewhere
+    """Whether an evaluation is of the run's adapter as it is: not scaled, and not of one with other weights."""
+    if not report.adapted or report.about.get("adapter_scale") not in (None, 1):
+        return False
+    evaluated = Path(report.about.get("adapter") or "") / WEIGHTS
+    if run.adapter is None or not evaluated.is_file():
+        return True  # nothing to compare with: the run was moved, or is an evaluation alone
+    return filecmp.cmp(evaluated, run.adapter / WEIGHTS, shallow=False)
 
 
 def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> None:

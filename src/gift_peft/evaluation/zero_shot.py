@@ -17,7 +17,7 @@ LONG_SIDE = 720  # of a picture in the figure
 
 
 def checkpoint_folders(run: SavedRun, steps: Sequence[int] = ()) -> dict[int, Path]:
-    """{step: folder} of a run's checkpoints: `steps`, else those it was told to keep, else all there are.
+    """{step: folder} of a run's checkpoints: `steps`, else those it was told to keep and has, else all there are.
 
     Raises FileNotFoundError for a step without a checkpoint, or a run without any.
     """
@@ -26,7 +26,8 @@ def checkpoint_folders(run: SavedRun, steps: Sequence[int] = ()) -> dict[int, Pa
         for path in run.path.glob("checkpoint-*")
         if path.name.split("-")[1].isdigit() and (path / "adapter_config.json").is_file()
     }
-    wanted = list(steps) or run.arguments.get("checkpoint_at_steps") or sorted(present)
+    kept = [step for step in run.arguments.get("checkpoint_at_steps") or [] if step in present]
+    wanted = list(steps) or kept or sorted(present)
     for step in wanted:
         if step not in present:
             listed = ", ".join(map(str, sorted(present))) or "none"

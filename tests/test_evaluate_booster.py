@@ -1,6 +1,7 @@
 """`evaluate_booster` against a straight-line evaluator, hand-computed scenes, and the traps of other evaluators."""
 
 import json
+import re
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -304,13 +305,20 @@ def test_reports_are_saved_and_loaded(tmp_path):
             load_report(folder)
 
 
-@pytest.mark.slow
-def test_the_benchmark_runs(tmp_path):
+def benchmark(folder, images, size):
     script = Path(__file__).parents[1] / "examples" / "benchmark_booster.py"
-    options = ["--scenes", "2", "--images", "3", "--size", "60x80", "--folder", tmp_path]
+    options = ["--scenes", 1, "--images", images, "--size", size, "--folder", folder]
     done = subprocess.run([sys.executable, script, *map(str, options)], capture_output=True, text=True, check=True)
-    assert "Booster balanced: 2 scenes, 3 images (mm)" in done.stdout
-    assert "3 images of 60x80 in" in done.stdout and "peak memory" in done.stdout
+    assert f"Booster balanced: 1 scene, {images} images (mm)" in done.stdout
+    assert f"{images} images of {size} in" in done.stdout
+    return int(re.search(r"peak memory (\d+) MiB", done.stdout)[1])
+
+
+@pytest.mark.slow
+def test_the_memory_of_a_full_size_scene_does_not_grow_with_its_images(tmp_path):
+    """What the benchmark prints, at the size that Booster has."""
+    few, many = (benchmark(tmp_path / str(images), images, "3008x4112") for images in (2, 6))
+    assert many < 1700 and many - few < 100  # MiB; an image more is 47 MiB of float32
 
 
 # ---- real data ----

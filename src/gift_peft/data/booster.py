@@ -122,6 +122,8 @@ def read_ground_truth(
     """
     _check_options(resize, occlusion, tom_classes)
     disparity = _read_disparity(scene.folder / "disp_00.npy")
+    if min(disparity.shape) * resize < 1:
+        raise ValueError(f"resize {resize}: no pixel is left of {disparity.shape[0]}x{disparity.shape[1]}")
     classes = _read_classes(scene.folder / "mask_cat.png", disparity.shape)
     focal, baseline = read_calibration(_calibration(scene.folder))
     keep = disparity > 0

@@ -173,6 +173,11 @@ def test_checkpoints_for_the_zero_shot_panel(run_folder):
     run = read_run(run_folder)
     assert list(checkpoint_folders(run, [4])) == [4]
     assert list(checkpoint_folders(run)) == [1, 4]  # those it was told to keep
+    run.arguments["checkpoint_at_steps"] = [4, 20000]  # training ended before
+    assert list(checkpoint_folders(run)) == [4]
+    with pytest.raises(FileNotFoundError, match=r"no such image: nowhere\.jpg"):
+        run_report([run_folder], zero_shot=["nowhere.jpg"])
+    assert not (run_folder / "report").exists()
     with pytest.raises(FileNotFoundError, match=r"no checkpoint of step 7 \(there are: 1, 2, 3, 4\)"):
         checkpoint_folders(run, [7])
 

@@ -107,6 +107,7 @@ def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Pat
             axis.axhline(1, color="0.5", linewidth=0.8)
             if max(max(values) for _, _, values in curves) > 10:
                 axis.set_yscale("log")
+            axis.xaxis.get_major_locator().set_params(integer=True)
             axis.set(title=title, xlabel="epoch", ylabel=ylabel)
             axis.title.set_fontsize(10)
             axis.legend(fontsize=8, frameon=False)

@@ -19,11 +19,12 @@ from gift_peft.evaluation.compare import write_compare
 from gift_peft.evaluation.curves import draw_dynamics, draw_retention
 from gift_peft.evaluation.figures import Panel, before_after, error_maps
 from gift_peft.evaluation.layout import Table, to_csv, to_latex, to_markdown, to_text
+from gift_peft.evaluation.predict import list_images, load_model
 from gift_peft.evaluation.results import BoosterReport
 from gift_peft.evaluation.runs import SavedRun, read_run, run_names
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table, protocol_note, uncertainty_table
-from gift_peft.evaluation.zero_shot import draw_zero_shot
+from gift_peft.evaluation.zero_shot import checkpoint_folders, draw_zero_shot
 from gift_peft.files import write_whole
 
 WEIGHTS = "adapter_model.safetensors"
@@ -103,6 +104,10 @@ def run_report(
         raise ValueError(f"{planned[0].path}: not a run yet; --model-card FILE writes the card of what it will be")
     if planned:
         return _write_card(saved[0], Path("model_card.md") if card is True else Path(card))
+    if zero_shot:  # what is wrong with it is said before minutes are spent on the rest
+        list_images(zero_shot)
+        for run in saved:
+            checkpoint_folders(run, steps)
     folder = Path(out) if out else saved[0].path / "report" if len(saved) == 1 else Path("report")
     folder.mkdir(parents=True, exist_ok=True)
     output = Output(folder, color)
@@ -296,8 +301,6 @@ def _panels(
     run: SavedRun, report: AnyReport, notable: dict, kept: dict[tuple[str, str], Panel], device: str | None
 ) -> Iterator[Panel]:
     """Panels group by group, the notable ones also into `kept`; only one group is in memory."""
-    from gift_peft.evaluation.predict import load_model
-
     about = report.about
     base = about.get("base") or run.arguments.get("model_name_or_path")
     loaded = load_model(

@@ -208,7 +208,8 @@ def test_calibrations_that_cannot_be(scene, focal, baseline, message):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"resize": 0}, "resize 0"), ({"resize": 0.01}, "resize 0.01: no pixel is left of 60x84"), ({"resize": 2}, "resize 2"), ({"occlusion": "occ"}, "unknown occlusion 'occ'"),
+    [({"resize": 0}, "resize 0"), ({"resize": 0.01}, "resize 0.01: no pixel is left of 60x84"),
+     ({"resize": 2}, "resize 2"), ({"occlusion": "occ"}, "unknown occlusion 'occ'"),
      ({"tom_classes": ()}, "tom_classes"), ({"tom_classes": (2, 4)}, "tom_classes")],
 )  # fmt: skip
 def test_wrong_options(scene, options, message):

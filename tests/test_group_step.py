@@ -1,92 +1,35 @@
-"""Snapshot and replay against autograd through the whole group, on one process, on two and on three."""
+"""Snapshot and replay against autograd through the whole group, on one process."""
 
 import math
 from contextlib import contextmanager
 
 import pytest
 import torch
-from accelerate import Accelerator, DistributedType, debug_launcher
-from accelerate.state import AcceleratorState, GradientState
+from accelerate import Accelerator, DistributedType
+from accelerate.state import AcceleratorState
+from group_tools import (
+    COUNTS,
+    CUTS,
+    DEAD,
+    DTYPES,
+    Toy,
+    autograd_gradients,
+    gift_model,
+    gradients,
+    group,
+    largest_error,
+    num_retained,
+    scale,
+    step_gradients,
+    toy,
+)
 from peft import LoraConfig, get_peft_model
-from tiny import tiny_model, tiny_processor, write_raw_tree
+from tiny import tiny_model
 from torch import nn
 
 from gift_peft.adapters import get_gift_model
-from gift_peft.data.gift_i import load_gift_i
-from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import gift_loss
-from gift_peft.training.teacher import make_proxies
-
-SIZE = (28, 28)
-COUNTS, CUTS = (2, 3, 5, 9), (1, 2, 4)
-DTYPES = {"float64": torch.float64, "float32": torch.float32}
-DEAD = "neck.fusion_stage.layers.0.residual_layer1"  # the first fusion has no residual: never a gradient
-
-
-def gift_model(dtype=torch.float64, spread=0.02):
-    """A tiny Depth Anything with a rank-2 adapter that is not at its start."""
-    torch.manual_seed(0)
-    model = get_gift_model(tiny_model(), rank=2).to(dtype)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            if parameter.requires_grad:
-                parameter += torch.randn(parameter.shape) * spread
-    return model
-
-
-def group(count, dtype=torch.float64, seed=0, size=SIZE):
-    """Pixels, masks (some pairs disjoint, one image all target), proxies near the predictions, valid masks."""
-    generator = torch.Generator().manual_seed(seed)
-    pixels = torch.randn(count, 3, *size, generator=generator, dtype=torch.float64)
-    mask = torch.rand(count, *size, generator=generator) < 0.5
-    mask[0, :, : size[1] // 2] = False
-    mask[-1, :, size[1] // 2 :] = False
-    if count > 2:
-        mask[1] = True
-    target = torch.rand(count, *size, generator=generator, dtype=torch.float64) * 40
-    valid = torch.rand(count, *size, generator=generator) < 0.9
-    return pixels.to(dtype), mask, target.to(dtype), valid
-
-
-def gradients(model):
-    return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
-
-
-def autograd_gradients(model, cut, pixels, mask, target, valid):
-    """Through one graph over all images, in float64 in one batch, in float32 over the same micro-batches."""
-    model.zero_grad(set_to_none=True)
-    predictions = torch.cat([model(pixel_values=x).predicted_depth for x in pixels.split(cut)])
-    loss = gift_loss(predictions, target, mask, 0.8, 1.5, valid)
-    loss.total.backward()
-    return loss, gradients(model)
-
-
-def step_gradients(model, cut, retain, data, accelerator=None):
-    model.zero_grad(set_to_none=True)
-    step = GroupStep(model, 0.8, 1.5, cut, retain, accelerator)
-    return step.accumulate(*data), gradients(model)
-
-
-def largest_error(got, want):
-    assert got.keys() == want.keys()
-    return max((got[name] - want[name]).abs().max().item() for name in want)
-
-
-def scale(values):
-    return max(value.abs().max().item() for value in values.values())
-
-
-def num_retained(count, cut, retain):
-    """Images of the last whole micro-batches that fit, counted one by one."""
-    sizes = [min(cut, count - start) for start in range(0, count, cut)]
-    kept = 0
-    while sizes and kept + sizes[-1] <= retain:
-        kept += sizes.pop()
-    return kept
-
-
-# ---- one process ----
 
 
 @pytest.fixture(scope="module", params=DTYPES)
@@ -134,26 +77,6 @@ def test_first_step_of_a_fresh_adapter_has_no_distillation():
         target = torch.cat([model(pixel_values=x).predicted_depth for x in pixels.split(2)])
     output = GroupStep(model).accumulate(pixels, mask, target)
     assert output.distillation == 0 and output.total == output.consistency > 0
-
-
-class Toy(nn.Module):
-    """Predicts (B,H,W) directly; `.seen` lists the batches, with grad or not."""
-
-    def __init__(self, dtype=torch.float32):
-        super().__init__()
-        self.conv = nn.Conv2d(3, 4, 3, padding=1, dtype=dtype)
-        self.out = nn.Conv2d(4, 1, 1, dtype=dtype)
-        self.unused = nn.Parameter(torch.zeros(3, dtype=dtype))
-        self.seen = []
-
-    def forward(self, pixel_values):
-        self.seen.append((len(pixel_values), torch.is_grad_enabled()))
-        return self.out(self.conv(pixel_values).tanh())[:, 0]
-
-
-def toy(dtype=torch.float32):
-    torch.manual_seed(0)
-    return Toy(dtype)
 
 
 def test_schedule():
@@ -372,159 +295,3 @@ def test_fp16_and_ddp_are_refused():
     wrapped = nn.parallel.DistributedDataParallel.__new__(nn.parallel.DistributedDataParallel)
     with pytest.raises(ValueError, match="DistributedDataParallel"):
         GroupStep(wrapped)
-
-
-# ---- two processes ----
-
-UPDATES = 20
-
-
-def train(model, accelerator, dtype):
-    """20 Adam updates on groups of changing size; the adapter's weights."""
-    parameters = [p for p in model.parameters() if p.requires_grad]
-    optimizer = torch.optim.Adam(parameters, lr=2e-5)
-    step = GroupStep(model, accelerator=accelerator)
-    for update in range(UPDATES):
-        step.accumulate(*group((5, 2, 3)[update % 3], dtype, seed=update))
-        optimizer.step()
-        optimizer.zero_grad()
-    return {name: p.detach().clone() for name, p in model.named_parameters() if p.requires_grad}
-
-
-def retained(name, count):
-    """Whether a graph was kept matters to the bits alone, so one precision will do."""
-    return (0, 2, count) if name == "float64" else (0,)
-
-
-def message_of(function, *args):
-    try:
-        function(*args)
-    except ValueError as error:
-        return str(error)
-
-
-def work(folder):
-    """Everything that two processes are asked, in one launch; each process leaves its answers in a file."""
-    AcceleratorState._reset_state(reset_partial_state=True)  # forked from a process that may have had its own
-    GradientState._reset_state()
-    torch.set_num_threads(1)
-    accelerator = Accelerator(cpu=True)
-    assert accelerator.num_processes == 2
-    answers = {}
-    for name, dtype in DTYPES.items():
-        model = gift_model(dtype)
-        for count in COUNTS:
-            for cut in CUTS:
-                data = group(count, dtype)
-                runs = {r: step_gradients(model, cut, r, data, accelerator) for r in retained(name, count)}
-                answers[name, count, cut] = runs
-        answers[name, "trained"] = train(gift_model(dtype, spread=0), accelerator, dtype)
-
-    answers["auto"] = [GroupStep(toy(), accelerator=accelerator).accumulate(*group(n, torch.float32)) for n in COUNTS]
-    model, (pixels, mask, target, _) = toy(), group(2, torch.float32)
-    for parameter in model.parameters():
-        parameter.grad = torch.full_like(parameter, 100)
-    step = GroupStep(model, accelerator=accelerator)
-    step.accumulate(pixels, mask, target)  # one micro-batch: process 1 has none
-    answers["on top"] = gradients(model)
-    answers["size"] = message_of(step.accumulate, pixels, mask[:, :14], target[:, :14])
-    with torch.no_grad():
-        model.out.bias.fill_(math.inf)
-    answers["infinite"] = message_of(step.accumulate, pixels, mask, target, None, ["left", "right"])
-    answers["after errors"] = gradients(model)
-    torch.save(answers, folder / f"{accelerator.process_index}.pt")
-
-
-@pytest.fixture(scope="module")
-def two(tmp_path_factory):
-    """The answers of process 0 and of process 1."""
-    folder = tmp_path_factory.mktemp("two")
-    debug_launcher(work, (folder,), num_processes=2)
-    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in (0, 1)]
-
-
-@pytest.mark.parametrize("cut", CUTS)
-@pytest.mark.parametrize("count", COUNTS)
-def test_two_processes_sum_to_the_gradient(two, model_of, count, cut):
-    dtype = next(model_of.parameters()).dtype
-    name = str(dtype).removeprefix("torch.")
-    expected, want = step_gradients(model_of, cut, 0, group(count, dtype))
-    runs, other_runs = (answers[name, count, cut] for answers in two)
-    for retain, (output, got) in runs.items():
-        other_output, other = other_runs[retain]
-        assert output == other_output and largest_error(got, other) == 0
-        assert largest_error(got, runs[0][1]) == 0  # whatever is retained
-        assert largest_error(got, want) < (1e-10 if dtype == torch.float64 else 1e-6 * scale(want))
-        assert output[:4] == expected[:4] and output.forwards == 2 * count - num_retained(count, cut, retain)
-
-
-def work_of_three(folder, base_dir, tree):
-    """Training, proxies and evaluation by three processes, with fewer micro-batches and groups than processes."""
-    AcceleratorState._reset_state(reset_partial_state=True)
-    GradientState._reset_state()
-    torch.set_num_threads(1)
-    accelerator = Accelerator(cpu=True)
-    assert accelerator.num_processes == 3
-    answers = {(name, "trained"): train(gift_model(d, spread=0), accelerator, d) for name, d in DTYPES.items()}
-    proxies = {"size": (56, 70), "proxies_dir": folder / "proxies"}
-    make_proxies(base_dir, tree, accelerator=accelerator, **proxies)
-    rows = load_gift_i(tree, "train", teacher=base_dir, **proxies)
-    report = evaluate_gift_i(rows, tiny_model(), accelerator=accelerator, processor=tiny_processor(), progress=False)
-    answers["evaluation"] = report.gce, report.rows
-    torch.save(answers, folder / f"{accelerator.process_index}.pt")
-
-
-@pytest.fixture(scope="module")
-def three(base_dir, tmp_path_factory):
-    """(the answers of each process, their folder, the tree they looked at: groups of 2 and of 5 images)."""
-    folder = tmp_path_factory.mktemp("three")
-    tree = write_raw_tree(folder / "raw", train=(2, 5), validation=())
-    list_of_rows = load_gift_i(tree, "train")  # the listing is cached by one process
-    assert len(list_of_rows) == 2
-    debug_launcher(work_of_three, (folder, base_dir, tree), num_processes=3)
-    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(3)], folder, tree
-
-
-@pytest.mark.parametrize(("name", "tolerance"), [("float64", 1e-9), ("float32", 1e-5)])
-def test_two_and_three_processes_train_the_same_adapter(two, three, name, tolerance):
-    model = gift_model(DTYPES[name], spread=0)
-    start = {key: p.detach().clone() for key, p in model.named_parameters() if p.requires_grad}
-    want = train(model, None, DTYPES[name])
-    for processes in (two, three[0]):
-        for answers in processes:
-            assert largest_error(processes[0][name, "trained"], answers[name, "trained"]) == 0
-        assert largest_error(processes[0][name, "trained"], want) < tolerance
-    assert largest_error(start, want) > 1e-4  # it did train
-
-
-def test_three_processes_share_proxies_and_evaluation(three, base_dir, tmp_path):
-    processes, folder, tree = three
-    options = {"size": (56, 70), "proxies_dir": tmp_path}
-    make_proxies(base_dir, tree, **options)
-    files = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*.safetensors"))
-    assert len(files) == 2
-    assert all((tmp_path / file).read_bytes() == (folder / "proxies" / file).read_bytes() for file in files)
-    rows = load_gift_i(tree, "train", teacher=base_dir, **options)
-    report = evaluate_gift_i(rows, tiny_model(), processor=tiny_processor(), progress=False)
-    for answers in processes:
-        assert repr(answers["evaluation"]) == repr((report.gce, report.rows))
-
-
-def test_two_processes_add_this_group_only(two):
-    model, data = toy(), group(2, torch.float32)
-    GroupStep(model).accumulate(*data[:3])
-    want = {name: g + 100 for name, g in gradients(model).items()} | {"unused": torch.full((3,), 100.0)}
-    for answers in two:
-        assert largest_error(answers["on top"], want) < 1e-5
-        assert largest_error(answers["after errors"], answers["on top"]) == 0
-
-
-def test_two_processes_retain_what_each_has_room_for(two):
-    for answers in two:
-        assert [output.forwards for output in answers["auto"]] == list(COUNTS)
-
-
-def test_two_processes_raise_together(two):
-    for answers in two:
-        assert "the prediction is 28x28 but mask and target are 14x28" in answers["size"]
-        assert "the prediction of left (image 0) has NaN or infinite values" in answers["infinite"]

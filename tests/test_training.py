@@ -366,3 +366,26 @@ def test_optimizer_state_covers_the_trained_weights(run):
     # The first fusion layer of a DPT neck has no residual input, so four of its weights never get a gradient.
     assert {name for name in trained - named if "fusion_stage.layers.0.residual_layer1" not in name} == set()
     assert named <= trained
+
+
+def test_recomputed_blocks_and_retained_graphs_do_not_change_a_bit(base_dir, tree, tmp_path, capsys):
+    runs = {"plain": {"retain": 0}, "checkpointed": {"gradient_checkpointing": True}}
+    for name, changes in runs.items():
+        train(arguments(base_dir, tree, tmp_path / name, max_steps=2, **changes))
+    assert capsys.readouterr().out.count("retain auto: up to") == 1
+    plain, checkpointed = (weights(tmp_path / name / "adapter-last") for name in runs)
+    assert all(torch.equal(checkpointed[key], plain[key]) for key in plain)
+
+
+def test_options_that_change_the_bits_are_near_and_may_not_be_changed_on_the_way(base_dir, tree, tmp_path):
+    changes = {"channels_last": True, "snapshot_micro_batch_size": 4, "retain": 0}
+    args = arguments(base_dir, tree, tmp_path / "out", max_steps=2, **changes)
+    train(args)
+    train(arguments(base_dir, tree, tmp_path / "plain", max_steps=2))
+    got, plain = weights(tmp_path / "out/adapter-last"), weights(tmp_path / "plain/adapter-last")
+    for key in plain:
+        torch.testing.assert_close(got[key], plain[key], rtol=0, atol=2.5 * 2 * args.learning_rate)  # Adam's signs
+    with pytest.raises(ValueError, match="retain: 0 became 2"):
+        train_again(args, retain=2, max_steps=3)
+    with pytest.raises(ValueError, match="channels_last: True became False"):
+        train_again(args, channels_last=False, max_steps=3)

@@ -353,6 +353,8 @@ def test_degenerate_maps_are_infinitely_distorted():
     horizon = np.array([[1, 0, 0], [0, 1, 0], [-1 / 300, 0, 1]])
     for matrix in (horizon, np.diag([-1.0, 1, 1]), np.full((3, 3), np.nan)):
         assert homography.distortion(matrix, corners) == np.inf
+    to_infinity = np.array([[1, 0, 0], [0, 1, 0], [-1 / 639, 0, 1]])  # the right border
+    assert homography.displacement(to_infinity, corners) == np.inf
 
 
 def test_valid_area_and_warp_against_the_oracle():

@@ -1,69 +1,22 @@
 """One group from photos to a checked, registered group on disk; `captures.py` runs this for every group of a tree."""
 
-import hashlib
-import json
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image
 
+from gift_peft.data.capture_job import Job, Outcome, capture_digest
 from gift_peft.data.layout import read_proxy
 from gift_peft.data.matching import Frame
-from gift_peft.data.prepare_arguments import PrepareSettings
 from gift_peft.data.quality import Small, check_frames, check_group_change, pairwise_changes
-from gift_peft.data.raw import Capture, check_count, check_masks, decode_capture, read_capture
+from gift_peft.data.raw import Capture, check_count, check_masks, decode_capture
 from gift_peft.data.registration import Registration, reason, register, valid_area, warp, warp_stored
 from gift_peft.data.writer import check_group_id, write_group
 
-FORMAT = 1  # of records and report; a new one makes every group again
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything
-
-
-@dataclass(frozen=True)
-class Job:
-    """One group to prepare: `source` is its folder, or the capture itself; `known` the digest it was made from."""
-
-    raw: Path
-    staging: Path
-    source: Path | Capture
-    split: str
-    settings: PrepareSettings
-    known: str | None = None
-
-    @property
-    def folder(self) -> Path:
-        return self.source.folder if isinstance(self.source, Capture) else self.source
-
-    @property
-    def group_id(self) -> str:
-        if isinstance(self.source, Capture):
-            return self.source.group_id
-        if self.settings.layout is None:
-            return self.source.name
-        start = self.raw / self.settings.layout.root / self.settings.layout.splits[self.split]
-        inside = self.source.relative_to(start).as_posix()
-        return self.source.name if inside == "." else inside.replace("/", "__")
-
-    def read(self) -> Capture:
-        if isinstance(self.source, Capture):
-            return self.source
-        if self.settings.layout is not None:
-            return self.settings.layout.read(self.source, self.split, self.raw)
-        return read_capture(self.source, self.split, self.raw)
-
-
-@dataclass
-class Outcome:
-    """What became of a group: its entry in the report, its metadata row if it is kept (now in the staging folder), and
-    the digest of what it was made from; `unchanged`: the digest is the known one, and nothing was done."""
-
-    digest: str | None
-    entry: dict
-    row: dict | None = None
-    unchanged: bool = False
 
 
 class Rejection(Exception):
@@ -83,35 +36,21 @@ def prepare_group(job: Job) -> Outcome:
         check_group_id(job.group_id)
         group.capture = job.read()
         group.start()
-        digest = _digest(group.capture, job.settings)
+        digest = capture_digest(group.capture, job.settings)
         if digest == job.known:
             return Outcome(digest, group.entry, unchanged=True)
         if None in group.capture.masks and not job.settings.propose_masks:
             check_masks(group.capture)
         group.decode()
-        return Outcome(digest, group.entry, group.prepare())
+        row = group.prepare()
+        return Outcome(digest, _finite(group.entry), row)
     except Rejection as rejection:
         group.reject(rejection.reasons)
     except (OSError, ValueError, cv2.error, MemoryError, RecursionError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
         group.reject([reason("unreadable", _printable(text.replace(f"{job.raw}{os.sep}", "")))])
         digest = None  # it may be a passing trouble (permissions, memory): try again next time
-    return Outcome(digest, group.entry)
-
-
-def _digest(capture: Capture, settings: PrepareSettings) -> str:
-    """Of the content of every file that decides what becomes of the group, and of the settings."""
-    stated = json.dumps([FORMAT, capture.split, asdict(settings)], sort_keys=True)
-    digest = hashlib.blake2b(stated.encode(), digest_size=16)
-    files = [*capture.images, *capture.proxies, capture.folder / "group.yaml"]
-    files += [path for mask in capture.masks if mask is not None for path in mask.files]
-    files += [capture.reference] if capture.reference is not None else []
-    for path in dict.fromkeys(files):
-        if path.is_file():
-            with path.open("rb") as file:
-                content = hashlib.file_digest(file, "blake2b").hexdigest()
-            digest.update(f"\n{os.path.relpath(path, capture.folder)} {content}".encode(errors="surrogateescape"))
-    return digest.hexdigest()
+    return Outcome(digest, _finite(group.entry))
 
 
 class _Group:
@@ -203,14 +142,18 @@ class _Group:
         static = self.settings.static_rig or self.capture.facts.get("static_rig", False)
         target = Frame(self.images[-1], self.masks[-1], settings)
         self.entry["target_frame"] = self.frames[-1]["name"]
+        self._valids: dict[str, np.ndarray] = {}
         self.maps: list[np.ndarray | None] = []
         for frame, image, mask in zip(self.frames[:-1], self.images, self.masks, strict=False):
             self.maps.append(self._note(frame, register(Frame(image, mask, settings), target, static)))
         self.maps.append(np.eye(3))
         self.treated_map = None
         if self.treated is not None:
-            # Nobody draws a mask for it; the camera may have moved a little, hence the wide margin.
-            around = None if self.masks[-1] is None else cv2.dilate(self.masks[-1].astype(np.uint8), np.ones((33, 33)))
+            # Nobody draws a mask for it, and the camera may have moved a little: the target's, and some more.
+            side = 2 * round(0.01 * float(np.hypot(*target.size))) + 1
+            around = (
+                None if self.masks[-1] is None else cv2.dilate(self.masks[-1].astype(np.uint8), np.ones((side, side)))
+            )
             treated = Frame(self.treated, None if around is None else around > 0, settings)
             result = register(treated, target, static, treated=True)
             self.treated_map = self._note(self.reference, result)
@@ -229,7 +172,7 @@ class _Group:
         frame["registration"] = {
             "method": result.method,
             "homography": None if result.matrix is None else result.matrix.tolist(),
-            **{key: _finite(result.figures.get(key)) for key in keys},
+            **{key: result.figures.get(key) for key in keys},
         }
         if "with_additions" in result.figures:
             frame["registration"]["with_additions"] = result.figures["with_additions"]
@@ -239,8 +182,13 @@ class _Group:
         return warp(array, matrix) if frame["status"] == "warped" else array
 
     def _valid(self, frame: dict, matrix: np.ndarray) -> np.ndarray:
-        width, height = self.entry["size"]
-        return valid_area(matrix, (width, height)) if frame["status"] == "warped" else np.ones((height, width), bool)
+        """(H, W) bool, computed once per frame: checks and files ask for it."""
+        if frame["name"] not in self._valids:
+            width, height = self.entry["size"]
+            whole = frame["status"] != "warped"
+            valid = np.ones((height, width), bool) if whole else valid_area(matrix, (width, height))
+            self._valids[frame["name"]] = valid
+        return self._valids[frame["name"]]
 
     def _propose(self) -> None:
         """Masks for a group that lacks some; they stay beside the dataset unless accepted."""
@@ -303,7 +251,7 @@ class _Group:
             kept, *check_frames(names, smalls, grays, target, changes, quality), strict=True
         ):
             frame = self.frames[index]
-            frame["quality"] = {key: _finite(value) for key, value in figures.items()}
+            frame["quality"] = figures
             frame["warnings"] = frame["warnings"] + warnings
             if reasons:
                 self._drop(frame, reasons)
@@ -349,7 +297,7 @@ class _Group:
         names = [frame["name"], self.entry["target_frame"]]
         figures, reasons, warnings = check_frames(names, both, [gray, gray], 1, unknown, self.settings.quality)
         about = ("clipped_dark", "clipped_bright", "outside_change", "outside_correlation")
-        frame["quality"] = {key: _finite(figures[0][key]) for key in about}
+        frame["quality"] = {key: figures[0][key] for key in about}
         codes = ("too_dark", "too_bright", "another_scene", "outside_change")
         frame["warnings"] = frame["warnings"] + [item for item in warnings[0] if item["code"] in codes]
         bad = [item for item in reasons[0] if item["code"] in codes]
@@ -440,5 +388,9 @@ def _printable(text: str) -> str:
 
 
 def _finite(value):
-    """JSON has no NaN: what could not be measured is null."""
+    """JSON has no NaN: what could not be measured is null, however deep it lies."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value

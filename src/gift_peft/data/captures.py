@@ -68,7 +68,8 @@ import PIL
 from tqdm import tqdm
 
 import gift_peft
-from gift_peft.data.capture_group import FORMAT, Job, Outcome, prepare_group
+from gift_peft.data.capture_group import prepare_group
+from gift_peft.data.capture_job import FORMAT, Job, Outcome
 from gift_peft.data.prepare_arguments import PrepareSettings
 from gift_peft.data.raw import SPLITS, find_groups
 from gift_peft.data.writer import write_card, write_rows

@@ -43,9 +43,10 @@ class Fit:
 
 
 def transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(N, 2) points through a (3, 3) homography, float64."""
+    """(N, 2) points through a (3, 3) homography, float64; a point that it sends to the horizon is not finite."""
     homogeneous = np.asarray(points, np.float64) @ matrix[:, :2].T + matrix[:, 2]
-    return homogeneous[:, :2] / homogeneous[:, 2:]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
 def corners_of(width: int, height: int) -> np.ndarray:
@@ -54,8 +55,9 @@ def corners_of(width: int, height: int) -> np.ndarray:
 
 
 def displacement(matrix: np.ndarray, points: np.ndarray) -> float:
-    """The farthest that a homography moves any of the points, in pixels."""
-    return float(np.linalg.norm(transform(matrix, points) - points, axis=1).max())
+    """The farthest that a homography moves any of the points, in pixels; infinite if it sends one to the horizon."""
+    farthest = np.linalg.norm(transform(matrix, points) - points, axis=1).max()
+    return float("inf") if np.isnan(farthest) else float(farthest)
 
 
 def distortion(matrix: np.ndarray, points: np.ndarray) -> float:

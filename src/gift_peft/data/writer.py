@@ -227,7 +227,7 @@ def _save(item, stem: Path) -> str:
         item = Image.fromarray(item.astype(np.uint8) * 255 if item.dtype == bool else item)
     else:
         item = _rgb(item, stem.name)
-    item.save(target)
+    item.save(target, compress_level=4)  # of a photo as small as at the usual 6, in a third of the time
     return target.name
 
 

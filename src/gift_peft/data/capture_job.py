@@ -1,0 +1,71 @@
+"""What the work on one group starts from and ends in, and the digest that tells whether it is done already."""
+
+import hashlib
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from gift_peft.data.prepare_arguments import PrepareSettings
+from gift_peft.data.raw import Capture, read_capture
+
+FORMAT = 1  # of records and report; a new one makes every group again
+
+
+@dataclass(frozen=True)
+class Job:
+    """One group to prepare: `source` is its folder, or the capture itself; `known` the digest it was made from."""
+
+    raw: Path
+    staging: Path
+    source: Path | Capture
+    split: str
+    settings: PrepareSettings
+    known: str | None = None
+
+    @property
+    def folder(self) -> Path:
+        return self.source.folder if isinstance(self.source, Capture) else self.source
+
+    @property
+    def group_id(self) -> str:
+        if isinstance(self.source, Capture):
+            return self.source.group_id
+        if self.settings.layout is None:
+            return self.source.name
+        start = self.raw / self.settings.layout.root / self.settings.layout.splits[self.split]
+        inside = self.source.relative_to(start).as_posix()
+        return self.source.name if inside == "." else inside.replace("/", "__")
+
+    def read(self) -> Capture:
+        if isinstance(self.source, Capture):
+            return self.source
+        if self.settings.layout is not None:
+            return self.settings.layout.read(self.source, self.split, self.raw)
+        return read_capture(self.source, self.split, self.raw)
+
+
+@dataclass
+class Outcome:
+    """What became of a group: its entry in the report, its metadata row if it is kept (now in the staging folder), and
+    the digest of what it was made from; `unchanged`: the digest is the known one, and nothing was done."""
+
+    digest: str | None
+    entry: dict
+    row: dict | None = None
+    unchanged: bool = False
+
+
+def capture_digest(capture: Capture, settings: PrepareSettings) -> str:
+    """Of the content of every file that decides what becomes of the group, and of the settings."""
+    stated = json.dumps([FORMAT, capture.split, asdict(settings)], sort_keys=True)
+    digest = hashlib.blake2b(stated.encode(), digest_size=16)
+    files = [*capture.images, *capture.proxies, capture.folder / "group.yaml"]
+    files += [path for mask in capture.masks if mask is not None for path in mask.files]
+    files += [capture.reference] if capture.reference is not None else []
+    for path in dict.fromkeys(files):
+        if path.is_file():
+            with path.open("rb") as file:
+                content = hashlib.file_digest(file, "blake2b").hexdigest()
+            digest.update(f"\n{os.path.relpath(path, capture.folder)} {content}".encode(errors="surrogateescape"))
+    return digest.hexdigest()

@@ -1,8 +1,13 @@
 """Pre-train the embedded base model from scratch on the opaque renders: two million weights, inverse depth in 1/m.
 
+    python examples/embedded/render_base.py --out renders/base --count 5400
     python examples/embedded/pretrain_base.py --out renders/first --scenes 2004 --steps 4500
-    python examples/embedded/pretrain_base.py --out renders/model --init renders/first/base --steps 900 \\
+    python examples/embedded/pretrain_base.py --out renders/second --init renders/first/base --steps 900 \\
         --learning_rate 5e-4
+    python examples/embedded/render_base.py --out renders/near --count 200
+    python examples/embedded/render_base.py --out renders/near --count 836 --first 2004
+    python examples/embedded/pretrain_base.py --renders renders/near --out renders/model --init renders/second/base \\
+        --steps 500 --learning_rate 5e-4
 
 Weighted L1 and a multi-scale gradient loss on inverse depth, AdamW with a one-cycle schedule, flips and colour jitter,
 an exponential average of the weights, bf16 autocast. The first `--held_out` scenes are never trained on; every 500

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 import torch
-from test_group_step import Toy, gradients, group, largest_error, toy
+from group_tools import Toy, gradients, group, largest_error, toy
 from torch import nn
 
 from gift_peft import retention

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from test_group_step import SIZE, gift_model, gradients, group, largest_error, step_gradients
+from group_tools import SIZE, gift_model, gradients, group, largest_error, step_gradients
 from torch import nn
 
 from gift_peft.adapters import get_gift_model

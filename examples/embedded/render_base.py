@@ -119,7 +119,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("renders/base"))
     parser.add_argument("--count", type=int, default=5400, help="pictures, two per scene")
-    parser.add_argument("--first", type=int, default=0, help=f"seed to begin with; {FIRST_NEAR} and above: near scenes")
+    parser.add_argument("--first", type=int, default=0, help=f"seed to begin with; near scenes from {FIRST_NEAR} on")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)

@@ -110,9 +110,7 @@ def plan(rng, kind: str):
     if kind != "solid" and (target.centre - scene.camera.origin) @ target.normal > -0.5:
         return None  # edge on, or seen from behind
     if kind != "solid" and len(target.holder) < 5:
-        target.holder += targets.border(
-            rng, target.centre, target.u, target.v, rng.uniform(0.03, 0.08), 0.05
-        )
+        target.holder += targets.border(rng, target.centre, target.u, target.v, rng.uniform(0.03, 0.08), 0.05)
     if kind == "solid":
         siblings = targets.solid_siblings(rng, target, int(rng.integers(1, 4)))
         centre = target.centre

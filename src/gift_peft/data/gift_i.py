@@ -22,6 +22,7 @@ import pyarrow.compute as pc
 from datasets import ClassLabel, Features, List, Value
 from datasets import Image as ImageFeature
 from datasets.builder import Key
+from tqdm import tqdm
 from huggingface_hub.constants import HF_HUB_CACHE
 
 from gift_peft.data.preprocess import SURFACES, image_digest, to_mask
@@ -354,7 +355,8 @@ def dataset_fingerprint(dataset: datasets.Dataset) -> str:
     The same for raw tree, prepared folder and parquet of the same groups, and for any order of the groups.
     """
     groups = []
-    for row in dataset.with_format(FORMAT_TYPE, rules=RowRules()):
+    rows = dataset.with_format(FORMAT_TYPE, rules=RowRules())
+    for row in tqdm(rows, desc="reading the dataset", unit="group", delay=2):
         digest = hashlib.sha256(row["group_id"].encode())
         for name, image, mask in zip(row["image_names"], row["images"], row["masks"], strict=True):
             digest.update(f"\n{name} {image_digest(image)} ".encode())

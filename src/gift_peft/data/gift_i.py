@@ -22,8 +22,8 @@ import pyarrow.compute as pc
 from datasets import ClassLabel, Features, List, Value
 from datasets import Image as ImageFeature
 from datasets.builder import Key
-from tqdm import tqdm
 from huggingface_hub.constants import HF_HUB_CACHE
+from tqdm import tqdm
 
 from gift_peft.data.preprocess import SURFACES, image_digest, to_mask
 from gift_peft.data.proxies import FORMAT, ProxyStore, default_proxies_dir, teacher_id, teacher_revision

@@ -63,7 +63,10 @@ def test_every_other_command_is_run_here():
         ["gift-peft", "predict"],
         ["gift-peft", "train"],
         ["gift-peft", "evaluate"],
+        ["gift-peft", "prepare"],
+        ["gift-peft", "export"],
         ["accelerate", "launch"],
+        ["gift-peft", "report"],
     ]
 
 
@@ -77,12 +80,18 @@ def test_python_blocks(workplace):
 
 @pytest.mark.filterwarnings("ignore:the base is the local folder")
 def test_commands(workplace):
-    predict, train, evaluate, launch = COMMANDS[2:]
+    predict, train, evaluate, prepare, export, launch, report = COMMANDS[2:]
     run(predict)
     assert len(list(Path("depth").glob("*.npy"))) == 4  # two photos, adapter and base
     run(train, "--num_train_epochs=1", "--size=56x70")
     assert Path("out/adapter/adapter_model.safetensors").exists()
     run(evaluate)
+    run(prepare)
+    assert Path("gift-i/report.html").exists()
+    run(export)
+    assert list(Path("release").rglob("*.parquet"))
+    run(report.replace("report demo", "report out"))
+    assert Path("out/report/model_card.md").exists()
     config = shlex.split(launch)[shlex.split(launch).index("--config") + 1]
     assert parse_arguments(["--config", str(ROOT / config)]).num_train_epochs == 50
 

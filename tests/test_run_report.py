@@ -233,6 +233,17 @@ def test_weights_are_compared_at_the_smallest_gce_and_collapse_does_not_compete(
     assert any("collapsed" in note for note in table.notes) and any("Protocol native" in note for note in table.notes)
 
 
+def test_the_collapse_alarm_counts_where_an_affine_fit_hides_it():
+    runs = [ablated(1.0, [0.5], [0.1]), ablated(0.0, [0.0], [0.11])]
+    runs[1].evaluations["evaluation"] = report_of(
+        random_rows([2, 3]), collapse={"target_mean_ratio": 1.0, "spread_ratio": 1e-6, "alarm": True}
+    )
+    table = ablation_table(runs)
+    assert [row[0] for row in table.body()] == ["1:1", "1:0†"]
+    assert [cell.good for cell in table.body()[0][2:]] == [True] * 3 and table.body()[1][2].good is None
+    assert any("Skipped: 0 of 5 images" in note for note in table.notes)
+
+
 def test_booster_columns_come_from_evaluations_where_training_logged_none():
     runs = [ablated(1.0, [0.5], [0.1]), ablated(2.0, [0.4], [0.1])]
     assert ablation_table(runs).columns == ["GCE ↓", "ToM RMSE ↓", "Other RMSE ↓"]

@@ -32,8 +32,8 @@ def is_ablation(runs: Sequence[SavedRun]) -> bool:
 def ablation_table(runs: Sequence[SavedRun]) -> Table:
     """One line per run; the best value of each column is marked.
 
-    A run whose Other RMSE is more than twice the base's at its minimum-GCE checkpoint has collapsed (it agrees on
-    nothing worth having): it is marked, and its values do not compete.
+    A run has collapsed if its evaluation raised the collapse alarm, or if its Other RMSE is more than twice the base's
+    at its minimum-GCE checkpoint: it agrees on nothing worth having. It is marked, and its values do not compete.
 
     Args:
         runs: those of `is_ablation`.
@@ -67,6 +67,9 @@ def _values(run: SavedRun) -> dict[str, float | None]:
 
 
 def _collapsed(run: SavedRun, row: dict) -> bool:
+    # (An affine fit hides a flattened output from the errors: a constant is never worse than the reference's spread.)
+    if any(report.collapse and report.collapse["alarm"] for report in run.evaluations.values()):
+        return True
     base, adapted = run.history[0].get("val_other_rmse"), row.get("val_other_rmse")
     return None not in (base, adapted) and adapted > DIVERGED * base
 
@@ -85,5 +88,5 @@ def _notes(runs: Sequence[SavedRun], collapsed: bool) -> list[str]:
         boosters = [report for report in reports if isinstance(report, BoosterReport)]
         notes += dict.fromkeys(f"Booster: {line}" for r in boosters for line in (protocol_note(r), skipped_note(r)))
     if collapsed:
-        notes.append(f"{COLLAPSED} collapsed: Other RMSE more than {DIVERGED:g} times the base's; not compared.")
+        notes.append(f"{COLLAPSED} collapsed (alarm, or Other RMSE over {DIVERGED:g} times the base's): not compared.")
     return notes

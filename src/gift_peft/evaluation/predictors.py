@@ -15,6 +15,7 @@ from gift_peft.evaluation.predict import load_model, predict_depth
 from gift_peft.evaluation.protocols import Protocol
 
 Predictor = Callable[[torch.Tensor], torch.Tensor]
+METRIC_MODELS = {"zoedepth", "depth_pro", "prompt_depth_anything"}  # they predict metres without saying so
 
 
 def make_predictors(model, teacher, baseline: bool, batch_size: int) -> tuple[dict[str, Predictor], Predictor]:
@@ -79,9 +80,6 @@ def _recipe(model):
         return get_recipe(model)
     except ValueError:
         return None  # an architecture without a recipe: its image processor states the size
-
-
-METRIC_MODELS = {"zoedepth", "depth_pro", "prompt_depth_anything"}  # they predict metres without saying so
 
 
 def to_millimetres(model: Any, protocol: Protocol) -> float:

@@ -19,7 +19,7 @@ from gift_peft import cli
 from gift_peft.data.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.data.writer import write_gift_i
 from gift_peft.group_step import GroupStep
-from gift_peft.training import checkpoints, loop, start, train
+from gift_peft.training import checkpoints, loop, train
 
 
 @pytest.fixture(scope="module")
@@ -157,9 +157,8 @@ def test_a_signal_in_the_middle_of_a_validation_stops_it(number, args, whole, tm
     with monkeypatch.context() as patch:
         # A validation of two groups reads the first one, to see what they are, and then both.
         stop = on_call(3 * number - 1, operator.getitem, lambda *a: os.kill(os.getpid(), signal.SIGTERM))
-        patch.setattr(
-            loop, "UntilStopped", lambda groups, stopped: start.UntilStopped(Stopping(groups, stop), stopped)
-        )
+        until = validation.UntilStopped
+        patch.setattr(validation, "UntilStopped", lambda groups, *signals: until(Stopping(groups, stop), *signals))
         result = train(args)
     assert (result.signal, result.step, len(result.metrics)) == (signal.SIGTERM, 2 * (number - 1), number - 1)
     assert checkpoints.checkpoint_fault(tmp_path / f"out/checkpoint-{result.step}") is None

@@ -22,18 +22,13 @@ from gift_peft.data.cache import default_cache_dir
 from gift_peft.data.gift_i import dataset_fingerprint, gift_i_splits, load_gift_i, proxies_command
 from gift_peft.data.preprocess import Group, resolve_size
 from gift_peft.data.proxies import teacher_revision
-from gift_peft.evaluation.booster import evaluate_booster
 from gift_peft.evaluation.cards import model_card
-from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.layout import number
-from gift_peft.evaluation.metrics import METRICS
 from gift_peft.evaluation.predict import load_base
-from gift_peft.evaluation.results import REGIONS
 from gift_peft.evaluation.tables import relative_change
 from gift_peft.files import jsonable
 from gift_peft.group_step import GroupStep
-from gift_peft.losses import GeometryConsistencyError
-from gift_peft.training import card, checkpoints
+from gift_peft.training import card, checkpoints, validation
 from gift_peft.training.arguments import FALLING, FREE_TO_CHANGE, GiftTrainingArguments
 from gift_peft.training.groups import PreparedGroups, epoch_order
 from gift_peft.training.profiling import profile_updates
@@ -41,7 +36,6 @@ from gift_peft.training.progress import Progress
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
 from gift_peft.training.start import (
     Interrupted,
-    UntilStopped,
     check_run,
     claim_folder,
     make_accelerator,
@@ -274,11 +268,11 @@ class Run:
     def finish_epoch(self, state: State, stop: SimpleNamespace) -> None:
         """Validate, write the row, keep the adapter if it is the best so far, write the checkpoint if it is due.
 
-        Interrupted, with `state` as it was, if a signal comes meanwhile.
+        Raises Interrupted, with `state` as it was, if a signal comes meanwhile.
         """
-        measured = self._validate(stop) | self._measure_booster()
+        measured = validation.validate(self, stop) | validation.measure_booster(self)
         if state.step == 0:
-            self._measure_base(state)
+            validation.measure_base(self, state)
         row = state.close_epoch(self.epoch_steps) | measured
         row = {key: jsonable(value) for key, value in row.items()}
         state.rows.append(row)
@@ -293,49 +287,6 @@ class Run:
         )
         if state.step and self._checkpoint_is_due(state.step):
             self.save_checkpoint(state)
-
-    def _measure_base(self, state: State) -> None:
-        """The base's own loss needs no forward: its predictions are the proxies, its distillation is 0."""
-        for group in self.train_groups.take(range(self.epoch_steps)):
-            error = GeometryConsistencyError()
-            consistency = error.update(group.target, group.mask, group.valid)
-            num_pairs = error.num_groups
-            consistency = consistency if num_pairs else 0.0
-            state.add(self.args.lambda_c * consistency, consistency, 0.0, num_pairs)
-
-    def _validate(self, stop: SimpleNamespace) -> dict:
-        """GCE and the errors against the teacher on the treated reference, in float32, spread over the processes."""
-        keys = [f"val_{region}_{metric}" for region in REGIONS for metric in METRICS]
-        if self.validation_groups is None:
-            return dict.fromkeys(["val_gce", *keys])
-        # Several processes evaluate their shares apart, and would have to agree after every group.
-        alone = self.accelerator.num_processes == 1
-        report = evaluate_gift_i(
-            UntilStopped(self.validation_groups, stop) if alone else self.validation_groups,
-            self.model,
-            kind=self.kind,
-            baseline=False,
-            accelerator=self.accelerator,
-            progress=False,
-        )
-        values = {f"val_{r}_{m}": report.summary[r][m] for r in REGIONS for m in METRICS}
-        return {"val_gce": report.gce["adapted"], **values}
-
-    def _measure_booster(self) -> dict:
-        """RMSE in mm on Booster (protocol `gift`, a quarter of its size), where a root is given."""
-        if self.args.booster_root is None:
-            return {}
-        report = evaluate_booster(
-            self.args.booster_root,
-            self.model,
-            kind=self.kind,
-            processor=self.processor,
-            size=self.size,
-            baseline=False,
-            accelerator=self.accelerator,
-            progress=False,
-        )
-        return {f"booster_{region}_rmse": report.summary[region]["rmse"] for region in ("tom", "other")}
 
     def _checkpoint_is_due(self, step: int) -> bool:
         every = self.args.checkpointing_steps or self.epoch_steps

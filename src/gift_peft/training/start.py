@@ -7,7 +7,7 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -123,26 +123,6 @@ def stop_signals() -> Iterator[SimpleNamespace]:
 
 class Interrupted(Exception):
     """A signal has come in the middle of a validation."""
-
-
-class UntilStopped(Sequence):
-    """`groups`, but reading one raises Interrupted after a signal: a validation may take longer than a cluster waits.
-
-    Args:
-        groups (`Sequence`): read by index.
-        stop (`SimpleNamespace`): what `stop_signals` gives.
-    """
-
-    def __init__(self, groups: Sequence, stop: SimpleNamespace) -> None:
-        self.groups, self.stop = groups, stop
-
-    def __len__(self) -> int:
-        return len(self.groups)
-
-    def __getitem__(self, index: int):
-        if self.stop.signum:
-            raise Interrupted
-        return self.groups[index]
 
 
 @contextmanager

@@ -1,0 +1,84 @@
+"""What a run measures between epochs: the base's own loss, GCE and errors on validation groups, RMSE on Booster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+from gift_peft.evaluation.booster import evaluate_booster
+from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.metrics import METRICS
+from gift_peft.evaluation.results import REGIONS
+from gift_peft.losses import GeometryConsistencyError
+from gift_peft.training.start import Interrupted
+
+if TYPE_CHECKING:
+    from gift_peft.training.loop import Run
+    from gift_peft.training.state import State
+
+
+class UntilStopped(Sequence):
+    """`groups`, but reading one raises Interrupted after a signal: a validation may take longer than a cluster waits.
+
+    Args:
+        groups (`Sequence`): read by index.
+        stop (`SimpleNamespace`): what `stop_signals` gives.
+    """
+
+    def __init__(self, groups: Sequence, stop: SimpleNamespace) -> None:
+        self.groups, self.stop = groups, stop
+
+    def __len__(self) -> int:
+        return len(self.groups)
+
+    def __getitem__(self, index: int):
+        if self.stop.signum:
+            raise Interrupted
+        return self.groups[index]
+
+
+def measure_base(run: Run, state: State) -> None:
+    """The base's own loss needs no forward: its predictions are the proxies, its distillation is 0."""
+    for group in run.train_groups.take(range(run.epoch_steps)):
+        error = GeometryConsistencyError()
+        consistency = error.update(group.target, group.mask, group.valid)
+        num_pairs = error.num_groups
+        consistency = consistency if num_pairs else 0.0
+        state.add(run.args.lambda_c * consistency, consistency, 0.0, num_pairs)
+
+
+def validate(run: Run, stop: SimpleNamespace) -> dict:
+    """GCE and the errors against the teacher on the treated reference, in float32, spread over the processes."""
+    keys = [f"val_{region}_{metric}" for region in REGIONS for metric in METRICS]
+    if run.validation_groups is None:
+        return dict.fromkeys(["val_gce", *keys])
+    # Several processes evaluate their shares apart, and would have to agree after every group.
+    alone = run.accelerator.num_processes == 1
+    report = evaluate_gift_i(
+        UntilStopped(run.validation_groups, stop) if alone else run.validation_groups,
+        run.model,
+        kind=run.kind,
+        baseline=False,
+        accelerator=run.accelerator,
+        progress=False,
+    )
+    values = {f"val_{r}_{m}": report.summary[r][m] for r in REGIONS for m in METRICS}
+    return {"val_gce": report.gce["adapted"], **values}
+
+
+def measure_booster(run: Run) -> dict:
+    """RMSE in mm on Booster (protocol `gift`, a quarter of its size), where a root is given."""
+    if run.args.booster_root is None:
+        return {}
+    report = evaluate_booster(
+        run.args.booster_root,
+        run.model,
+        kind=run.kind,
+        processor=run.processor,
+        size=run.size,
+        baseline=False,
+        accelerator=run.accelerator,
+        progress=False,
+    )
+    return {f"booster_{region}_rmse": report.summary[region]["rmse"] for region in ("tom", "other")}

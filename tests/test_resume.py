@@ -19,7 +19,7 @@ from gift_peft import cli
 from gift_peft.data.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.data.writer import write_gift_i
 from gift_peft.group_step import GroupStep
-from gift_peft.training import checkpoints, loop, train
+from gift_peft.training import checkpoints, loop, train, validation
 
 
 @pytest.fixture(scope="module")

@@ -161,9 +161,22 @@ def test_damaged_runs_are_named(run_folder, spoil, message):
     assert not (run_folder / "report").exists()
 
 
+def test_runs_of_one_name_do_not_overwrite_each_other(run_folder, tmp_path):
+    other = Path(shutil.copytree(run_folder, tmp_path / "elsewhere" / "my-run"))
+    folder = run_report([run_folder, other], tmp_path / "both", panels=1)
+    names = {path.name for path in folder.iterdir()}
+    assert {"before-after-my-run.png", "before-after-my-run-2.png", "compare-my-run-2.html"} <= names
+    tables = {path.name for path in (folder / "tables").iterdir()}
+    assert {"gift-i-proxy.csv", "gift-i-proxy-my-run-groups.csv", "gift-i-proxy-my-run-2-groups.csv"} <= tables
+    with pytest.raises(ValueError, match="panels: must not be negative, got -1"):
+        run_report([run_folder], panels=-1)
+
+
 def test_a_card_of_several_runs_and_a_report_of_a_plan_are_refused(run_folder, tmp_path):
     with pytest.raises(ValueError, match="--model-card is of one run"):
         run_report([run_folder, run_folder], card=True)
+    with pytest.raises(ValueError, match=r"evaluation: no config\.yaml, so nothing says what was trained"):
+        run_report([run_folder / "evaluation"], card=True)
     plan = ROOT / "examples" / "vggt_1b.yaml"
     with pytest.raises(ValueError, match=r"vggt_1b\.yaml: not a run yet; --model-card FILE"):
         run_report([plan])
@@ -263,6 +276,8 @@ def test_runs_that_differ_in_more_are_no_ablation():
     assert run_names([runs[0]]) == ["b"] and run_names(runs) == ["b 1:1", "b 1:2"]
     runs[1].arguments["lambda_d"] = 1.0
     assert run_names(runs) == ["b (run-1.0)", "b (run-2.0)"]
+    runs[1].path = Path("elsewhere") / "run-1.0"
+    assert run_names(runs) == ["b (run-1.0)", "b (run-1.0-2)"]
 
 
 def ablate(monkeypatch, *argv) -> int:

@@ -21,7 +21,7 @@ from gift_peft.evaluation.figures import Panel, before_after, error_maps
 from gift_peft.evaluation.layout import Table, to_csv, to_latex, to_markdown, to_text
 from gift_peft.evaluation.predict import list_images, load_model
 from gift_peft.evaluation.results import BoosterReport
-from gift_peft.evaluation.runs import SavedRun, read_run, run_names
+from gift_peft.evaluation.runs import SavedRun, folder_names, read_run, run_names
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table, protocol_note, uncertainty_table
 from gift_peft.evaluation.zero_shot import checkpoint_folders, draw_zero_shot
@@ -86,7 +86,7 @@ def run_report(
         card: also write the model card of the (only) run: True for `out`/model_card.md, or a file.
         zero_shot: pictures for the panel of base and checkpoints, or folders of them.
         steps: the checkpoints of that panel; default those the run was told to keep (`checkpoint_at_steps`), else all.
-        panels: rows of the before/after figure; 0 draws no pictures and loads no model.
+        panels: rows of the before/after figure; 0 draws no pictures.
         device (*optional*): for the models.
         color: of the tables printed.
 
@@ -94,11 +94,13 @@ def run_report(
         FileNotFoundError: a folder that is neither run nor evaluation; a picture or checkpoint that is not there.
         ValueError: a damaged file; a card of several runs.
     """
-    if not runs:
-        raise ValueError("report needs a run")
+    if not runs or panels < 0:
+        raise ValueError(f"panels: must not be negative, got {panels}" if runs else "report needs a run")
     saved = [read_run(path) for path in runs]
     if card and len(saved) > 1:
         raise ValueError("--model-card is of one run: name one")
+    if card and not saved[0].arguments:
+        raise ValueError(f"{saved[0].path}: no config.yaml, so nothing says what was trained; name the run's folder")
     planned = [run for run in saved if run.path.is_file()]
     if planned and not card:
         raise ValueError(f"{planned[0].path}: not a run yet; --model-card FILE writes the card of what it will be")
@@ -116,14 +118,11 @@ def run_report(
         _evaluate_if_missing(run, output, device)
     _tables(saved, names, output)
     _curves(saved, names, output)
-    if panels:
-        for run, name in zip(saved, names, strict=True):
-            _pictures(
-                run, name, output, panels, device, suffix=f"-{run.path.resolve().name}" if len(saved) > 1 else ""
-            )
-    if zero_shot:
-        for run in saved:
-            _zero_shot(run, zero_shot, steps, output, device)
+    for run, name, own in zip(saved, names, folder_names(saved), strict=True):
+        if panels:
+            _pictures(run, name, output, panels, device, f"-{own}" if len(saved) > 1 else "")
+        if zero_shot:
+            _zero_shot(run, f"zero-shot-{own}", zero_shot, steps, output, device)
     if card:
         path = _write_card(saved[0], folder / "model_card.md" if card is True else Path(card))
         output.sections.append(f"Model card: [{path.name}]({path.name if path.parent == folder else path})\n")
@@ -178,23 +177,24 @@ def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> N
 
 def _tables(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> None:
     """One comparison per dataset and protocol, with intervals and groups of every report behind it."""
-    together: dict[tuple, list[tuple[str, SavedRun, AnyReport]]] = {}
-    for run, name in zip(runs, names, strict=True):
+    together: dict[tuple, list[tuple[str, str, AnyReport]]] = {}
+    for run, name, own in zip(runs, names, folder_names(runs), strict=True):
         for report in run.evaluations.values():
             key = (_dataset(report), report.unit, protocol_note(report))
-            together.setdefault(key, []).append((_scaled(name, report), run, report))
+            together.setdefault(key, []).append((_scaled(name, report), own, report))
     used: dict[str, int] = {}
     for (dataset, *_), entries in together.items():
         used[dataset] = used.get(dataset, 0) + 1
         stem = dataset if used[dataset] == 1 else f"{dataset}-{used[dataset]}"
         output.sections.append(f"## {HEADINGS[dataset]}\n")
         output.table(stem, comparison_table([(name, report) for name, _, report in entries]), show=True)
-        for name, run, report in entries:
-            own = f"{stem}-{run.path.resolve().name}" if len(entries) > 1 else stem
+        for number, (name, own, report) in enumerate(entries):
             if len(entries) > 1:
                 output.sections.append(f"### {name}\n")
-            output.table(f"{own}-intervals", uncertainty_table(report))
-            output.table(f"{own}-groups", group_table(report))
+            again = sum(other == own for _, other, _ in entries[:number])  # a run evaluated twice this way
+            full = f"{stem}-{own}" + (f"-{again + 1}" if again else "") if len(entries) > 1 else stem
+            output.table(f"{full}-intervals", uncertainty_table(report))
+            output.table(f"{full}-groups", group_table(report))
     if is_ablation(runs):
         output.sections.append("## Loss weights\n")
         output.table("loss-weights", ablation_table(runs), show=True)
@@ -373,9 +373,8 @@ def _group_panels(report, find, group_id: str, labels: dict[str, str], loaded, o
 
 
 def _zero_shot(
-    run: SavedRun, images: Sequence[str | Path], steps: Sequence[int], output: Output, device: str | None
+    run: SavedRun, name: str, images: Sequence[str | Path], steps: Sequence[int], output: Output, device: str | None
 ) -> None:
-    name = f"zero-shot-{run.path.resolve().name}"
     files = [output.folder / f"{name}.png", output.folder / f"{name}.pdf"]
     try:
         draw_zero_shot(run, images, steps, files, device)

@@ -81,14 +81,26 @@ def read_run(path: str | Path) -> SavedRun:
 
 def run_names(runs: Sequence[SavedRun]) -> list[str]:
     """What each run is called in tables: its base, and where several share one the loss weights or else the folder."""
-    bases = [_base_name(run) for run in runs]
+    bases, folders = [_base_name(run) for run in runs], folder_names(runs)
     names = list(bases)
     for index, (run, base) in enumerate(zip(runs, bases, strict=True)):
         others = [other for other, name in zip(runs, bases, strict=True) if name == base]
         if len(others) < 2:
             continue
         distinct = None not in (ratios := [other.weights for other in others]) and len(set(ratios)) == len(others)
-        names[index] = f"{base} {ratio(run)}" if distinct else f"{base} ({run.path.resolve().name})"
+        names[index] = f"{base} {ratio(run)}" if distinct else f"{base} ({folders[index]})"
+    return names
+
+
+def folder_names(runs: Sequence[SavedRun]) -> list[str]:
+    """What each run is called in file names: its folder, with a number where several folders have one name."""
+    names: list[str] = []
+    for run in runs:
+        number, name = 1, run.path.resolve().name
+        while name in names:
+            number += 1
+            name = f"{run.path.resolve().name}-{number}"
+        names.append(name)
     return names
 
 

@@ -162,6 +162,10 @@ def test_damaged_and_nan_proxies(raw_tree, base_dir):
     safetensors.torch.save_file({"other": torch.zeros(1)}, path)
     with pytest.raises(ValueError, match=r"damaged proxy .*scene_100.*not a proxy file"):
         load_gift_i(raw_tree, "validation", teacher=base_dir)[0]
+    for text in ("{", json.dumps({key: header[key] for key in header if key != "images"})):
+        safetensors.torch.save_file(tensors, path, metadata={"gift_peft": text})
+        with pytest.raises(ValueError, match=r"(damaged|stale) proxy .*scene_100.*--overwrite"):
+            load_gift_i(raw_tree, "validation", teacher=base_dir)[0]
     write_proxies(path, header, **tensors)
     path.write_bytes(path.read_bytes()[:500])
     for use in (

@@ -143,7 +143,7 @@ def read_header(path: Path, command: str = "gift-peft proxies") -> dict:
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             return json.loads((file.metadata() or {}).get(METADATA, "{}"))
-    except safetensors.SafetensorError as error:
+    except (safetensors.SafetensorError, json.JSONDecodeError) as error:
         raise ValueError(
             f"damaged proxy {path} ({str(error).splitlines()[0]}); make it again with `{command} --overwrite`"
         ) from None
@@ -155,13 +155,13 @@ def difference(header: dict, expected: dict, names: Sequence[str]) -> str | None
         if key in expected and header.get(key) != expected[key]:
             what = {"revision": "model or revision", "processor": "image processor"}.get(key, key)
             return f"it was made with {what} {header.get(key)}, not {expected[key]}"
-    made, now = header["images"], expected["images"]
+    made, now = header.get("images", []), expected["images"]
     if len(made) != len(now):
         return f"it was made for {len(made)} images, and the group has {len(now)}"
     for name, before, after in zip(names, made, now, strict=True):
         if before != after:
             return f"image {name} has changed since"
-    if header["reference"] != expected["reference"]:
+    if header.get("reference") != expected["reference"]:
         return "the treated reference has changed since"
     return None
 

@@ -13,6 +13,7 @@ import argparse
 import json
 import platform
 import resource
+import sys
 import time
 from importlib.metadata import version
 
@@ -88,6 +89,7 @@ def measure(args: argparse.Namespace) -> dict:
             batches = pixels.split(args.micro_batch_size)
             return torch.cat([model(pixel_values=batch.to(device)).predicted_depth.float() for batch in batches])
 
+    print(f"{args.backbone} built; forward of {args.images} images ...", file=sys.stderr)
     report["forward_seconds"], proxies = timed(forward, device)
     report["peak_gib_after_forward"] = peak_gib(device)
 
@@ -97,6 +99,7 @@ def measure(args: argparse.Namespace) -> dict:
         optimizer.zero_grad()
         return output
 
+    print(f"forward: {report['forward_seconds']} s; group step ...", file=sys.stderr)
     report["group_step_seconds"], output = timed(update, device)
     report["peak_gib_after_group_step"] = peak_gib(device)
     report["image_forwards"] = output.forwards

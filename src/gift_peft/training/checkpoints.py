@@ -74,6 +74,19 @@ def read_state(folder: Path) -> dict:
     return json.loads((folder / STATE).read_text(encoding="utf-8"))
 
 
+def check_identity(before: dict, now: dict) -> None:
+    """Raise ValueError naming the first argument of a run's identity that changed since the checkpoint."""
+    changed = {
+        "model_name_or_path": "the base model's weights have",
+        "dataset_name": "its images, masks or groups have",
+        "group_order": "the order of the training groups has",
+    }
+    for name in sorted(before.keys() | now.keys()):
+        if before.get(name) != now.get(name):
+            what = changed.get(name, f"{before.get(name)} became {now.get(name)}, it has")
+            raise ValueError(f"resume_from_checkpoint: {name}: {what} changed since the checkpoint was written")
+
+
 def find_checkpoint(output_dir: Path, name: str, warn: Callable[[str], None]) -> Path | None:
     """The folder that `resume_from_checkpoint` names; for "latest" the newest complete one, telling which are broken.
 

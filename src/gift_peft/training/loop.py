@@ -315,7 +315,7 @@ class Run:
             before, state = saved.pop("identity"), State(**saved)
         except (KeyError, TypeError, AttributeError):
             raise ValueError(f"resume_from_checkpoint: {checkpoint} is of another version of gift-peft") from None
-        _check_identity(before, self.identity)
+        checkpoints.check_identity(before, self.identity)
         if state.step > self.total_steps:
             raise ValueError(f"resume_from_checkpoint: {checkpoint} is past the {self.total_steps} steps of this run")
         checkpoints.read_checkpoint(checkpoint, self.model, self.optimizer)
@@ -394,19 +394,6 @@ def _recipe(args: GiftTrainingArguments, base: torch.nn.Module) -> tuple[GiftRec
     except ValueError as error:
         names = "target_modules, modules_to_save and prediction_kind"
         raise ValueError(f"model_name_or_path: {error} (as arguments: {names})") from None
-
-
-def _check_identity(before: dict, now: dict) -> None:
-    """Raise ValueError naming the first argument that changed since the checkpoint."""
-    changed = {
-        "model_name_or_path": "the base model's weights have",
-        "dataset_name": "its images, masks or groups have",
-        "group_order": "the order of the training groups has",
-    }
-    for name in sorted(before.keys() | now.keys()):
-        if before.get(name) != now.get(name):
-            what = changed.get(name, f"{before.get(name)} became {now.get(name)}, it has")
-            raise ValueError(f"resume_from_checkpoint: {name}: {what} changed since the checkpoint was written")
 
 
 def _how_to_resume(output: Path, step: int) -> str:

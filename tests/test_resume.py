@@ -374,5 +374,5 @@ def test_a_falling_learning_rate_goes_on_where_it_was(base_dir, tree, tmp_path, 
         train(args)
     train_again(args)
     assert_same_run(tmp_path / "out", tmp_path / "whole")
-    with pytest.raises(ValueError, match="resume_from_checkpoint: num_train_epochs: .*changed since the checkpoint"):
+    with pytest.raises(ValueError, match=r"resume_from_checkpoint: num_train_epochs: .*changed since the checkpoint"):
         train_again(args, num_train_epochs=3)

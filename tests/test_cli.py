@@ -50,7 +50,7 @@ def train_arguments(base, tree, out):
 def test_help_lists_the_verbs(run):
     code, out, _ = run("--help")
     assert code == 0
-    for verb in ("demo", "proxies", "train", "evaluate", "predict"):
+    for verb in ("demo", "proxies", "train", "evaluate", "predict", "report"):
         assert f"\n    {verb} " in out
         assert run(verb, "--help")[0] == 0
     assert "--lambda_c" in run("train", "--help")[1]

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
+from tqdm import tqdm
+
 from gift_peft.evaluation.booster import evaluate_booster
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.metrics import METRICS
@@ -40,7 +42,9 @@ class UntilStopped(Sequence):
 
 def measure_base(run: Run, state: State) -> None:
     """The base's own loss needs no forward: its predictions are the proxies, its distillation is 0."""
-    for group in run.train_groups.take(range(run.epoch_steps)):
+    groups = run.train_groups.take(range(run.epoch_steps))
+    quiet = not run.accelerator.is_main_process
+    for group in tqdm(groups, "first look", run.epoch_steps, unit="group", delay=2, disable=quiet):
         error = GeometryConsistencyError()
         consistency = error.update(group.target, group.mask, group.valid)
         num_pairs = error.num_groups

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from gift_peft.demo.run import KINDS
 from gift_peft.evaluation.report import run_report
 
 CARDS = Path(__file__).parents[2] / "model_cards"
@@ -27,8 +28,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("demo", type=Path, help="folder of a demo that ended")
     demo = parser.parse_args().demo
-    groups = [demo / "gift-i" / "validation" / name / "images" for name in ("mirror_000", "pane_000", "solid_000")]
-    pictures = [min(folder.iterdir()) for folder in groups]
+    groups = [min((demo / "gift-i" / "validation").glob(f"{kind}_*")) for kind in KINDS]
+    pictures = [min((group / "images").iterdir()) for group in groups]
     folder = run_report([demo], card=CARDS / "demo_adapter.md", zero_shot=pictures)
     for name, target in FIGURES.items():
         reduce(folder / f"{name}.png", CARDS / f"demo_{target}.png")

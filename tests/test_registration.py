@@ -206,6 +206,8 @@ def test_treated_reference_passes_by_its_pixels():
     treated[mask] = 150
     result = register(Frame(treated, mask, strict), Frame(picture, mask, strict), treated=True)
     assert result.status == "identity" and result.method == "pixels" and result.warnings[0]["code"] == "by_pixels"
+    exact = RegistrationSettings(paper_exact=True)  # the paper leaves references alone
+    assert register(Frame(treated, mask, exact), Frame(picture, mask, exact), treated=True).method == "paper"
     other = register(Frame(scene(9, (360, 480)), mask, strict), Frame(picture, mask, strict), treated=True)
     assert other.status == "dropped"
 
@@ -229,6 +231,17 @@ def test_settings_are_obeyed():
         assert result.status == "dropped" and code in [item["code"] for item in result.reasons], (name, result)
     still = RegistrationSettings(identity_displacement=20)
     assert register(Frame(frame, there, still), Frame(picture, mask, still)).status in ("identity", "warped")
+
+
+def test_settings_that_are_refused():
+    for name, value in (
+        ("contrast_threshold", 0),
+        ("min_contrast_threshold", 0.0),
+        ("confidence", 1.0),
+        ("max_iterations", 0),
+    ):
+        with pytest.raises(ValueError, match=name):
+            RegistrationSettings(**{name: value})
 
 
 # ---- real photographs ----

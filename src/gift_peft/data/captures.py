@@ -39,7 +39,7 @@ groups            list, in the order of the dataset, of:
     prepared      path relative to OUT | null
     mask          prepared mask, relative to OUT | null (always null for the reference)
     valid         prepared valid mask, relative to OUT | null
-    registration  null (target frame, or never reached) | {"method": "declared static" | "features" | "pixels",
+    registration  null (target frame, or never reached) | {"method" (of `registration.Registration`),
                   "homography": 3 rows of 3 floats, frame -> target frame in pixels | null,
                   "matches", "inliers", "inlier_ratio", "spread", "median_displacement", "corner_displacement",
                   "target_displacement", "expected_error" (px at the target's corners), "contrast_threshold",

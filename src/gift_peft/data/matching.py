@@ -55,6 +55,15 @@ class RegistrationSettings:
     max_distortion: float = 0.08
     min_correlation: float = 0.5
 
+    def __post_init__(self):
+        for name in ("contrast_threshold", "min_contrast_threshold", "edge_threshold", "reprojection_threshold"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"{name}: must be positive and finite, got {getattr(self, name)}")
+        if not 0 < self.confidence < 1:
+            raise ValueError(f"confidence: must be between 0 and 1, got {self.confidence}")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations: must be at least 1, got {self.max_iterations}")
+
 
 MAX_FEATURES = 6000
 

@@ -22,7 +22,7 @@ class Registration:
     Args:
         status (`str`): "identity" (leave the pixels alone), "warped", or "dropped".
         matrix (`np.ndarray`, *optional*): (3, 3), frame to target frame, pixels; None if dropped.
-        method (`str`): "declared static", "features" or "pixels".
+        method (`str`): "declared static", "features", "pixels", or "paper" (it leaves a treated reference alone).
         reasons (`list[dict]`): {"code", "text"}, why it was dropped.
         warnings (`list[dict]`): likewise, what to look at although it was not.
         figures (`dict`): what was measured (`captures.py` lists the keys).
@@ -63,16 +63,16 @@ def register(moving: Frame, fixed: Frame, declared_static: bool = False, treated
             result = Registration("identity", np.eye(3), "pixels", [], warnings, result.figures | by_pixels)
     paper = _paper_verdict(moving, fixed)
     result.figures["paper_exact"] = {key: value for key, value in paper.items() if key != "matrix"}
-    return _by_the_paper(paper, result) if settings.paper_exact else result
+    return _by_the_paper(paper, result, treated) if settings.paper_exact else result
 
 
 def _decide(match: Matches, moving: Frame, fixed: Frame, treated: bool) -> Registration:
     """From matches that determine a map: identity, or the warp if nothing speaks against it."""
     settings = fixed.settings
-    fit = _refine(match, moving, fixed)
+    fit, error = _refine(match, moving, fixed)
     matrix = np.linalg.inv(fit.matrix)
     frame_corners = corners_of(*fixed.size)
-    error, moved = fit.expected_error(fixed.corners), displacement(fit.matrix, fixed.corners)
+    moved = displacement(fit.matrix, fixed.corners)
     corner, bent = displacement(fit.matrix, frame_corners), distortion(fit.matrix, frame_corners)
     before, after = difference_outside(moving, fixed, matrix)
     figures = _figures(match, fixed) | {
@@ -87,6 +87,10 @@ def _decide(match: Matches, moving: Frame, fixed: Frame, treated: bool) -> Regis
     hidden = moved - 2 * error > settings.identity_displacement and after < 0.97 * before
     if match.median_displacement < settings.identity_displacement and not hidden:
         return Registration("identity", np.eye(3), figures=figures)
+    if fit is not match.fit and moved < settings.identity_displacement and _still_by(fit, match, settings):
+        text = "the matches move by half a pixel or more, the pixels outside the target do not"
+        warnings = [reason("by_pixels", text)]
+        return Registration("identity", np.eye(3), "pixels", [], warnings, figures)
     bound = settings.max_displacement * float(np.hypot(*fixed.size))
     ratio = match.inlier_ratio
     checks = [
@@ -131,6 +135,13 @@ def _decide(match: Matches, moving: Frame, fixed: Frame, treated: bool) -> Regis
     return Registration("warped", matrix, "pixels" if warnings else "features", [], warnings, figures)
 
 
+def _still_by(fit: Fit, match: Matches, settings: RegistrationSettings) -> bool:
+    """Whether a map leaves the places of the agreeing matches where they are, by the median."""
+    here = match.fixed[match.agreeing]
+    moves = np.linalg.norm(transform(fit.matrix, here) - here, axis=1)
+    return float(np.median(moves)) < settings.identity_displacement
+
+
 def _paper_verdict(moving: Frame, fixed: Frame) -> dict:
     """What the paper's numbers alone say, features inside the target included."""
     settings = fixed.settings
@@ -146,8 +157,11 @@ def _paper_verdict(moving: Frame, fixed: Frame) -> dict:
     }
 
 
-def _by_the_paper(paper: dict, ours: Registration) -> Registration:
+def _by_the_paper(paper: dict, ours: Registration, treated: bool) -> Registration:
+    """The paper registers observations only; a treated reference stays as it is."""
     figures = ours.figures | {"with_additions": {"status": ours.status, "reasons": ours.reasons}}
+    if treated:
+        return Registration("identity", np.eye(3), "paper", figures=figures)
     if paper["accepted"]:
         return Registration("warped", paper["matrix"], figures=figures)
     ratio = paper["inlier_ratio"]
@@ -213,18 +227,25 @@ def _diagnose(tries: list[Matches], fixed: Frame) -> list[dict]:
     return _weak(tries[-1], fixed)
 
 
-def _refine(match: Matches, moving: Frame, fixed: Frame) -> Fit:
-    """The fit to the matches, or the one to the pixels from there, where that is surer and the matches bear it out."""
-    by_pixels = fit_pixels(fixed.levels, moving.levels, match.fit.matrix)
-    if by_pixels is None:
-        return match.fit
-    by_points = match.fit
+def _refine(match: Matches, moving: Frame, fixed: Frame) -> tuple[Fit, float]:
+    """The better of the fits to the matches and, from there, to the pixels, and its error at the target's corners.
+
+    The pixels are taken where they are surer and the matches bear them out. Where they say something else, the two
+    disagree by more than either admits, and that is the error.
+    """
+    by_points, by_pixels = match.fit, fit_pixels(fixed.levels, moving.levels, match.fit.matrix)
+    error = by_points.expected_error(fixed.corners)
+    if by_pixels is None or by_pixels.correlation < fixed.settings.min_correlation:
+        return by_points, error
     here, there = match.fixed[match.agreeing], match.moving[match.agreeing]
     residual = [
         np.median(np.linalg.norm(transform(fit.matrix, here) - there, axis=1)) for fit in (by_points, by_pixels)
     ]
-    surer = by_pixels.expected_error(fixed.corners) < by_points.expected_error(fixed.corners)
-    return by_pixels if surer and residual[1] < 1.2 * residual[0] + 0.1 else by_points
+    by_pixels_error = by_pixels.expected_error(fixed.corners)
+    if by_pixels_error < error and residual[1] < 1.2 * residual[0] + 0.3:
+        return by_pixels, by_pixels_error
+    apart = transform(by_points.matrix, fixed.corners) - transform(by_pixels.matrix, fixed.corners)
+    return by_points, max(error, float(np.linalg.norm(apart, axis=1).max()))
 
 
 def _identity_by_pixels(moving: Frame, fixed: Frame) -> dict | None:

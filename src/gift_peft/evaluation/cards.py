@@ -212,7 +212,8 @@ def _recipe(arguments: Mapping, record: Mapping | None, base: Base | None) -> st
         f"| input size | {height_width} (height x width), plain bicubic resize |",
         f"| loss | consistency : distillation = {_get(arguments, 'lambda_c', 1)}:{_get(arguments, 'lambda_d', 1)} |",
         f"| optimisation | Adam, learning rate {_get(arguments, 'learning_rate', 2e-5)} "
-        f"({arguments.get('lr_scheduler_type', 'constant')}), weight decay {_get(arguments, 'weight_decay', 0)}, {_epochs(arguments)}, one update per group |",
+        f"({arguments.get('lr_scheduler_type', 'constant')}), weight decay {_get(arguments, 'weight_decay', 0)}, "
+        f"{_epochs(arguments)}, one update per group |",
         f"| precision | {_precision(precision, base)} |",
     ]
     text = "\n".join(rows)

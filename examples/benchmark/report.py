@@ -2,6 +2,8 @@
 
 import os
 import platform
+import shlex
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -27,6 +29,7 @@ def machine() -> dict:
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "load_at_start": os.getloadavg()[0],
+        "command": shlex.join(["python", "examples/benchmark_group_step.py", *sys.argv[1:]]),
         "python": platform.python_version(),
         **{name: version(name) for name in ("gift-peft", "torch", "transformers", "peft", "accelerate")},
     }
@@ -37,7 +40,7 @@ def to_markdown(results: dict) -> str:
     lines = [
         "# Speed of the group step",
         "",
-        f"`OMP_NUM_THREADS={facts['threads']} python examples/benchmark_group_step.py --out model_cards` on "
+        f"`OMP_NUM_THREADS={facts['threads']} {facts['command']}` on "
         f"{facts['cores']} cores ({facts['cpu']}), {facts['threads']} threads, load {facts['load_at_start']:.1f} "
         f"when it started. Python {facts['python']}, "
         + ", ".join(f"{n} {facts[n]}" for n in ("torch", "transformers", "peft", "accelerate"))

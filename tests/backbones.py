@@ -88,3 +88,11 @@ def metric3d_golden(name: str = "golden_public") -> tuple[dict, dict, Metric3DCo
 
 def picture(height: int = 60, width: int = 80, seed: int = 0) -> Image.Image:
     return Image.fromarray(np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8))
+
+
+def images(*shape, seed=1):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def relative(ours, theirs):
+    return ((ours - theirs).abs() / theirs.abs()).max().item()

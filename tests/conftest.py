@@ -10,9 +10,11 @@ import datasets
 import pytest
 import torch
 from records import records
+from runs import arguments
 from tiny import tiny_model, write_base, write_raw_tree
 
 from gift_peft.data import register, write_gift_i
+from gift_peft.training import train
 
 torch.set_num_threads(1)
 
@@ -54,3 +56,17 @@ def fresh_cache(tmp_path_factory, monkeypatch):
     """No test sees what another, or the user, has cached."""
     register()
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    """A raw tree of two train groups and one validation group."""
+    return write_raw_tree(tmp_path_factory.mktemp("tree") / "raw")
+
+
+@pytest.fixture(scope="module")
+def whole(base_dir, tree, tmp_path_factory):
+    """An uninterrupted run of four updates."""
+    out = tmp_path_factory.mktemp("whole") / "out"
+    train(arguments(base_dir, tree, out))
+    return out

@@ -16,7 +16,7 @@ import pytest
 from backbones import metric3d_golden
 from runs import arguments, assert_same_run, run_in_child, run_in_processes, train_again
 from safetensors.torch import save_file
-from tiny import SIZE, write_raw_tree
+from tiny import SIZE
 
 from gift_peft.files import write_whole
 from gift_peft.group_step import GroupStep
@@ -25,19 +25,6 @@ from gift_peft.training import checkpoints, train
 from gift_peft.training.teacher import make_proxies
 
 NOBODY = 65534
-
-
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return write_raw_tree(tmp_path_factory.mktemp("tree") / "raw")
-
-
-@pytest.fixture(scope="module")
-def whole(base_dir, tree, tmp_path_factory):
-    """An uninterrupted run of four updates."""
-    out = tmp_path_factory.mktemp("whole") / "out"
-    train(arguments(base_dir, tree, out))
-    return out
 
 
 @pytest.fixture

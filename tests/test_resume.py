@@ -13,26 +13,12 @@ import torch
 from accelerate import debug_launcher
 from accelerate.state import AcceleratorState
 from runs import arguments, assert_same_run, run_in_child, train_again, weights
-from tiny import write_raw_tree
 
 from gift_peft import cli
 from gift_peft.data.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.data.writer import write_gift_i
 from gift_peft.group_step import GroupStep
 from gift_peft.training import checkpoints, loop, train, validation
-
-
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return write_raw_tree(tmp_path_factory.mktemp("tree") / "raw")
-
-
-@pytest.fixture(scope="module")
-def whole(base_dir, tree, tmp_path_factory):
-    """An uninterrupted run of four updates."""
-    out = tmp_path_factory.mktemp("whole") / "out"
-    train(arguments(base_dir, tree, out))
-    return out
 
 
 @pytest.fixture

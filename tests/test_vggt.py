@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from backbones import VGGT, tiny_vggt, vggt_golden
+from backbones import VGGT, images, relative, tiny_vggt, vggt_golden
 from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel
 from transformers.modeling_outputs import DepthEstimatorOutput
 
@@ -35,15 +35,7 @@ def tiny():
     return tiny_vggt()
 
 
-def images(*shape, seed=1):
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
-
-
 # ---- the official network's results ----
-
-
-def relative(ours, theirs):
-    return ((ours - theirs).abs() / theirs.abs()).max().item()
 
 
 def of_maximum(ours, theirs):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from backbones import FIXTURES, VGGT, tiny_vggt, vggt_golden
+from backbones import FIXTURES, VGGT, images, relative, tiny_vggt, vggt_golden
 from safetensors.torch import save_file
 
 from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation
@@ -31,14 +31,6 @@ def golden(official):
 @pytest.fixture(scope="module")
 def tiny():
     return tiny_vggt()
-
-
-def images(*shape, seed=1):
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
-
-
-def relative(ours, theirs):
-    return ((ours - theirs).abs() / theirs.abs()).max().item()
 
 
 # ---- as a transformers model ----

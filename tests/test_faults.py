@@ -3,11 +3,11 @@
 Each ends in one line that says what to do, and the run goes on from there to the same bits.
 """
 
+import ctypes
 import os
 import shutil
 import signal
 import subprocess
-import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,8 +23,6 @@ from gift_peft.group_step import GroupStep
 from gift_peft.models.convert import convert_metric3d
 from gift_peft.training import checkpoints, train
 from gift_peft.training.teacher import make_proxies
-
-NOBODY = 65534
 
 
 @pytest.fixture
@@ -131,27 +129,30 @@ def test_a_full_disk_leaves_no_half_converted_model(disk, tmp_path):
 
 
 @pytest.fixture
-def common(base_dir, tree):
-    """(base, raw tree, folder) where every user may read and, in the folder, write."""
-    root = Path(tempfile.mkdtemp())
-    shutil.copytree(base_dir, root / "base")
-    shutil.copytree(tree, root / "raw")
-    (root / "work").mkdir()
-    for path in [root, *root.rglob("*")]:
-        path.chmod(0o755 if path.is_dir() else 0o644)
-    (root / "work").chmod(0o777)
-    yield root / "base", root / "raw", root / "work"
-    shutil.rmtree(root)
+def common(base_dir, tree, tmp_path):
+    """(base, raw tree, an empty folder)."""
+    (tmp_path / "work").mkdir()
+    return base_dir, tree, tmp_path / "work"
 
 
-def as_nobody(work, function):
-    """What `function()` raises, as "<class>: <message>", in a process without root's rights."""
+def obey_permissions():
+    """From here on this process, root's too, heeds the permission bits of files (capset(2); new threads inherit it)."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # _LINUX_CAPABILITY_VERSION_3, this thread
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; then the same for capabilities from 32
+    if libc.capget(header, sets) == 0:
+        for index in range(3):
+            sets[index] &= ~0b110  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
+        if libc.capset(header, sets) == 0:
+            return
+    raise OSError(ctypes.get_errno(), "capabilities could not be dropped")
+
+
+def as_a_user(work, function):
+    """What `function()` raises, as "<class>: <message>", in a process that heeds permissions."""
 
     def run():
-        if os.getuid() == 0:
-            os.setgroups([])
-            os.setgid(NOBODY)
-            os.setuid(NOBODY)
+        obey_permissions()
         datasets.config.HF_DATASETS_CACHE = work / "datasets"
         try:
             function()
@@ -178,7 +179,7 @@ def test_an_output_folder_that_cannot_be_written(exists, common):
         (locked / "out").mkdir()
         (locked / "out").chmod(0o555)
     locked.chmod(0o555)
-    message = as_nobody(work, lambda: train(common_arguments(common, out=locked / "out")))
+    message = as_a_user(work, lambda: train(common_arguments(common, out=locked / "out")))
     assert message.startswith("PermissionError: ") and str(locked / "out") in message and "\n" not in message
     assert names(locked) == (["out"] if exists else []) and not (exists and names(locked / "out"))
 
@@ -192,7 +193,7 @@ def test_an_output_folder_that_is_locked_while_the_run_goes_on(common, whole):
         checkpoints.write_checkpoint = lock
         train(args)
 
-    message = as_nobody(work, run)
+    message = as_a_user(work, run)
     assert message.startswith("OSError: ") and "could not be written" in message and "checkpoint-2" in message
     (work / "out").chmod(0o755)
     assert checkpoints.checkpoint_fault(work / "out/checkpoint-1") is None
@@ -205,7 +206,7 @@ def test_proxies_that_cannot_be_written(common):
     work = common[2]
     (work / "proxies").mkdir()
     (work / "proxies").chmod(0o555)
-    message = as_nobody(work, lambda: train(common_arguments(common)))
+    message = as_a_user(work, lambda: train(common_arguments(common)))
     assert message.startswith("PermissionError: ") and "`gift-peft proxies --base" in message
     assert names(work / "proxies") == []
 

@@ -10,6 +10,7 @@ import sys
 import datasets
 import numpy as np
 import pytest
+from filelock import FileLock
 from photos import capture, motion, moved, scene, target, with_content, write_capture
 from PIL import Image
 
@@ -307,6 +308,18 @@ def test_places_that_are_refused(made, tmp_path):
     assert (tmp_path / "full/holiday.jpg").read_text() == "mine"
     with pytest.raises(ValueError, match="num_proc"):
         prepare(raw, tmp_path / "new", num_proc=0)
+
+
+def test_one_run_at_a_time_in_a_folder(made, tmp_path):
+    raw, out = copied(made, tmp_path)
+    (out / "report.json").unlink()
+    with FileLock(out / ".prepare/lock"):
+        before = snapshot(out)
+        with pytest.raises(ValueError, match=r"another gift-peft prepare is at work") as error:
+            prepare(raw, out)
+        assert "\n" not in str(error.value)
+        assert {**before, out / ".prepare/lock": None} == {**snapshot(out), out / ".prepare/lock": None}
+    assert prepare(raw, out)["groups"] and (out / "report.json").exists()
 
 
 def test_arguments(tmp_path):

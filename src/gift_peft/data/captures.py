@@ -58,6 +58,7 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -65,6 +66,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import PIL
+from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 import gift_peft
@@ -112,10 +114,40 @@ def prepare(
     _check_places(raw, out)
     groups = settings.layout.find(raw) if settings.layout is not None else find_groups(raw)
     staging = out / STATE / "staging"
-    shutil.rmtree(staging, ignore_errors=True)
-    staging.mkdir(parents=True)
     jobs = [Job(raw, staging, source, split, settings) for split in SPLITS for source in groups.get(split, [])]
     _check_names(jobs)
+    with _alone(out):
+        shutil.rmtree(staging, ignore_errors=True)
+        staging.mkdir()
+        report, rows = _make_groups(raw, out, settings, jobs, num_proc)
+        shutil.rmtree(staging, ignore_errors=True)
+        if any(rows.values()):
+            write_card(rows, out, license, pretty_name or f"GIFT-I: {raw.resolve().name}", _describe(report))
+        else:
+            for name in ("README.md", "groups.jsonl"):
+                (out / name).unlink(missing_ok=True)
+        write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False))
+        from gift_peft.data.capture_report import write_html
+
+        write_html(out, report)
+    return report
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """One run at a time in OUT; the system lifts the lock of a run that was killed."""
+    (out / STATE).mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(out / STATE / "lock", timeout=0):
+            yield
+    except Timeout:
+        raise ValueError(f"OUT {out}: another gift-peft prepare is at work there; wait for it") from None
+
+
+def _make_groups(
+    raw: Path, out: Path, settings: PrepareSettings, jobs: list[Job], num_proc: int
+) -> tuple[dict, dict[str, dict[str, dict]]]:
+    """The report, and the dataset's rows, of what OUT now holds."""
     records = {(job.split, job.group_id): _read_record(out, job) for job in jobs}
     removed = _remove_others(out, records.keys())
     kept = {key: record["row"] for key, record in records.items() if record and record["row"]}
@@ -133,19 +165,8 @@ def prepare(
                     _write_rows(out, kept, jobs)
                 records[key] = _write_record(out, job, outcome)
             bar.update()
-    shutil.rmtree(staging, ignore_errors=True)
     entries = [records[job.split, job.group_id]["entry"] for job in jobs]
-    report = _report(raw, out, settings, entries, removed)
-    if kept:
-        write_card(_rows(kept, jobs), out, license, pretty_name or f"GIFT-I: {raw.resolve().name}", _describe(report))
-    else:
-        for name in ("README.md", "groups.jsonl"):
-            (out / name).unlink(missing_ok=True)
-    write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False))
-    from gift_peft.data.capture_report import write_html
-
-    write_html(out, report)
-    return report
+    return _report(raw, out, settings, entries, removed), _rows(kept, jobs)
 
 
 def _check_places(raw: Path, out: Path) -> None:

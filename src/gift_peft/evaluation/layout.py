@@ -173,9 +173,14 @@ def to_markdown(table: Table) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A `table*` environment for the booktabs package; improvements are bold, the notes are in the caption."""
+    """A `table*` environment for the packages booktabs and graphicx, no wider than the text.
+
+    Improvements are bold, the notes are in the caption.
+    """
     layout = "l" * len(table.labels) + "r" * len(table.columns)
-    lines = [r"\begin{table*}[t]", r"  \centering", r"  \small", rf"  \begin{{tabular}}{{{layout}}}", r"    \toprule"]
+    lines = [r"\begin{table*}[t]", r"  \centering", r"  \small"]
+    lines += [r"  \resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%"]
+    lines += [rf"  \begin{{tabular}}{{{layout}}}", r"    \toprule"]
     if table.spans:
         first, over, rules = len(table.labels) + 1, [], []
         for title, count in table.spans:
@@ -192,7 +197,7 @@ def to_latex(table: Table) -> str:
         texts = [rf"\textbf{{{_latex(cell.text)}}}" if cell.good else _latex(cell.text) for cell in cells]
         lines.append("    " + " & ".join(texts) + r" \\")
     caption = " ".join([f"{table.title}.", *table.notes]) if table.title else " ".join(table.notes)
-    lines += [r"    \bottomrule", r"  \end{tabular}", rf"  \caption{{{_latex(caption)}}}", r"\end{table*}"]
+    lines += [r"    \bottomrule", r"  \end{tabular}}", rf"  \caption{{{_latex(caption)}}}", r"\end{table*}"]
     return "\n".join(lines) + "\n"
 
 

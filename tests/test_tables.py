@@ -334,7 +334,8 @@ def test_latex_is_escaped_and_balanced():
     assert r"\caption{50 \% of \{it\}. note\_1: 100 \%}" in text
     rows = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert {len(re.findall(r"(?<!\\)&", row)) for row in rows[1:]} == {2}  # (the first spans columns)
-    assert text.count(r"\begin{") == text.count(r"\end{") == 2
+    assert text.count(r"\begin{") == text.count(r"\end{") == 2 and r"\resizebox{" in text
+    assert len(re.findall(r"(?<!\\){", text)) == len(re.findall(r"(?<!\\)}", text))
     assert not re.search(r"(?<!\\)[%_]", re.sub(r"\$[^$]*\$", "", text))
 
 

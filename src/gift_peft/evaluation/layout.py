@@ -179,8 +179,8 @@ def to_latex(table: Table) -> str:
     """
     layout = "l" * len(table.labels) + "r" * len(table.columns)
     lines = [r"\begin{table*}[t]", r"  \centering", r"  \small"]
-    lines += [r"  \resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%"]
-    lines += [rf"  \begin{{tabular}}{{{layout}}}", r"    \toprule"]
+    fitted = r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{"
+    lines += [rf"  {fitted}\begin{{tabular}}{{{layout}}}", r"    \toprule"]
     if table.spans:
         first, over, rules = len(table.labels) + 1, [], []
         for title, count in table.spans:

@@ -85,6 +85,14 @@ def test_sizes_can_come_from_a_file(case, tmp_path):
         assert (again / file).read_bytes() == (folder / file).read_bytes()
 
 
+@pytest.mark.parametrize("text", ["{", "[1]", '{"embed_dim": "big"}', '{"num_heads": 0}'])
+def test_bad_sizes_are_one_line(case, tmp_path, text):
+    (tmp_path / "sizes.json").write_text(text)
+    with pytest.raises(ValueError, match=r"sizes\.json: not the sizes") as caught:
+        CONVERTERS[case[0]](case[1], tmp_path / "out", tmp_path / "sizes.json")
+    assert "\n" not in str(caught.value) and not (tmp_path / "out").exists()
+
+
 def test_bad_sources_leave_nothing_behind(case, tmp_path):
     name, source, config, _ = case
     cut, other = tmp_path / "cut.pth", tmp_path / "other.safetensors"

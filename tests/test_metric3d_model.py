@@ -148,6 +148,14 @@ def test_encoder_blocks_compile_without_graph_breaks():
         close(model(pixels).predicted_depth, expected, DEPTH)
 
 
+def test_export_leaves_the_batch_free():
+    model = tiny_metric3d(iters=1)
+    batch = torch.export.Dim("batch", min=1, max=8)
+    with torch.no_grad():
+        program = torch.export.export(model, (images(2, 3, 28, 28),), dynamic_shapes=({0: batch},))
+        assert program.module()(images(3, 3, 28, 28)).predicted_depth.shape == (3, 28, 28)
+
+
 # ---- configuration ----
 
 
@@ -256,6 +264,7 @@ def test_bad_checkpoints_end_in_one_clear_error(tmp_path, weights, capsys):
         ({key: value for key, value in state.items() if key != bias}, config, f"{bias} is missing"),
         ({**state, "depth_model.more": torch.zeros(1)}, config, "depth_model.more has no place"),
         ({**state, bias: state[bias].int()}, config, f"{bias} holds torch.int32"),
+        ({**state, token: torch.tensor(1.0)}, None, "which is none of small, large, giant2"),
         ({**state, bias: 3.0}, config, f"{bias} is a float"),
         ({**state, twice: state[twice] + 1}, config, f"{twice} and .* different values"),
     ]

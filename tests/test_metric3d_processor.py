@@ -80,6 +80,7 @@ def test_processor_errors():
         (None, [500], "need target_sizes"),
         ([(30, 40)], [0], "positive"),
         ([(30, 40)], [float("nan")], "positive"),
+        ([(30, 40)], [None], "positive"),
         ([(30, 40)], [1, 2], "2 focal lengths for 1"),
     ):
         with pytest.raises(ValueError, match=message):

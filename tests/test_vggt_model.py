@@ -230,7 +230,7 @@ def test_bad_files(tmp_path, official, kind, message):
     assert "\n" not in str(error.value) and str(path) in str(error.value)
 
 
-def test_checkpoints_of_another_variant(official):
+def test_checkpoints_of_another_variant(official, tmp_path):
     sizes = SIDECAR["config"]
     with pytest.raises(ValueError, match=r"aggregator\.camera_token has shape .*64.* asks for .*1024"):
         VggtForDepthEstimation.from_official(official)
@@ -245,3 +245,17 @@ def test_checkpoints_of_another_variant(official):
         VggtForDepthEstimation.from_official(broken, VggtConfig(**sizes))
     with pytest.raises(FileNotFoundError, match="nowhere"):
         VggtForDepthEstimation.from_official("nowhere.pt")
+    save_file(broken, tmp_path / "int.safetensors")
+    with pytest.raises(ValueError, match=r"depth_head\.norm\.bias holds torch\.int64"):
+        VggtForDepthEstimation.from_official(tmp_path / "int.safetensors", VggtConfig(**sizes))
+
+
+def test_a_file_cut_anywhere_is_one_clear_error(tmp_path):
+    torch.save({"aggregator.x": torch.zeros(3)}, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    content = (tmp_path / "old.pt").read_bytes()
+    path = tmp_path / "cut.pt"
+    for length in range(0, len(content), 3):
+        path.write_bytes(content[:length])
+        with pytest.raises(ValueError, match=r"cut\.pt: ") as error:
+            VggtForDepthEstimation.from_official(path)
+        assert "\n" not in str(error.value)

@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub.errors import StrictDataclassError
 from safetensors import SafetensorError
 from transformers import PreTrainedConfig, PreTrainedModel
 
@@ -75,12 +76,19 @@ def _check_free(folder: Path) -> None:
         raise ValueError(f"{folder} already exists: name a new folder")
 
 
+def _read_config(config_class: type[PreTrainedConfig], path: str | Path) -> PreTrainedConfig:
+    try:
+        return config_class.from_json_file(path)
+    except (ValueError, TypeError, ArithmeticError, StrictDataclassError) as error:  # no JSON, or wrong values
+        raise ValueError(f"{path}: not the sizes of a model ({' '.join(str(error).split())})") from None
+
+
 def _convert(
     model_class: type[PreTrainedModel], processor: Any, source: Path, folder: str | Path, config: Any
 ) -> Path:
     folder = Path(folder)
     if config is not None and not isinstance(config, PreTrainedConfig):
-        config = model_class.config_class.from_json_file(config)
+        config = _read_config(model_class.config_class, config)
     model = model_class.from_official(source, config)
     temporary = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)

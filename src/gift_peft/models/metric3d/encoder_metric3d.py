@@ -107,10 +107,10 @@ class Metric3DEncoder(nn.Module):
         """(B,3,H,W), sides multiples of the patch, to four (B,1+R+h*w,C), shallow to deep."""
         x = self.patch_embed(pixel_values)
         grid = x.shape[-2:]
-        x = torch.cat([self.cls_token.expand(len(x), -1, -1), x.flatten(2).transpose(1, 2)], dim=1)
+        x = torch.cat([self.cls_token.expand(x.shape[0], -1, -1), x.flatten(2).transpose(1, 2)], dim=1)
         x = x + self._positions(*grid)
         if self.register_tokens is not None:
-            x = torch.cat([x[:, :1], self.register_tokens.expand(len(x), -1, -1), x[:, 1:]], dim=1)
+            x = torch.cat([x[:, :1], self.register_tokens.expand(x.shape[0], -1, -1), x[:, 1:]], dim=1)
         features, quarter = [], self.config.depth // 4
         for index, block in enumerate(self.blocks[0], start=1):
             x = block(x)

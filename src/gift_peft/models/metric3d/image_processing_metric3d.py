@@ -130,7 +130,12 @@ class Metric3DImageProcessorPil(PilBackend):
 
     def _canonical_to_metric(self, original: tuple[int, int], focal_length: float | tuple[float, float]) -> float:
         """Metres per canonical metre: the focal length at the network's size over the canonical one."""
-        lengths = [float(value) for value in np.ravel(focal_length)]
+        if isinstance(focal_length, torch.Tensor):
+            focal_length = focal_length.tolist()
+        try:
+            lengths = [float(value) for value in np.ravel(focal_length)]
+        except (TypeError, ValueError):
+            lengths = []
         if len(lengths) not in (1, 2) or not all(0 < value < float("inf") for value in lengths):
             raise ValueError(f"a focal length is fx or (fx, fy), positive pixels, got {focal_length!r}")
         scales = self._resize_scales(original)

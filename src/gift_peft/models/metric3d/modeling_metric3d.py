@@ -185,7 +185,7 @@ class Metric3DForDepthEstimation(PreTrainedModel):
 
 def _released_config(state: Mapping[str, torch.Tensor], where: str) -> Metric3DConfig:
     """The config of the variant whose tokens have this width; ValueError if there is none."""
-    width = state[WIDTH].shape[-1]
+    width = (0, *state[WIDTH].shape)[-1]
     for variant, sizes in VARIANTS.items():
         if sizes["embed_dim"] == width:
             return Metric3DConfig(variant=variant)

@@ -5,6 +5,7 @@ track heads are left on disk.
 """
 
 import pickle
+import struct
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,11 @@ from safetensors import SafetensorError, safe_open
 
 DEPTH_PATH = ("aggregator.", "depth_head.")
 WRAPPERS = ("model_state_dict", "state_dict", "model")
+# What torch.load raises for cut and changed bytes, found by trying.
+DAMAGED = (
+    *(RuntimeError, EOFError, OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError),
+    *(ArithmeticError, struct.error, zipfile.BadZipFile),
+)
 OPTIONAL = "aggregator.patch_embed.mask_token"  # only pre-training used it; some files leave it out
 
 
@@ -49,6 +55,8 @@ def check_official(state: Mapping[str, torch.Tensor], expected: Mapping[str, tor
             raise ValueError(
                 f"{where}: {name} has shape {tuple(state[name].shape)}, the config asks for {tuple(tensor.shape)}"
             )
+        if not state[name].is_floating_point():
+            raise ValueError(f"{where}: {name} holds {state[name].dtype}, not floating-point weights")
     for name in state:
         if name not in expected:
             raise ValueError(f"{where}: {name} has no place in the config's model; is this another variant?")
@@ -67,8 +75,6 @@ def _depth_path(content: object, where: str) -> dict[str, torch.Tensor]:
     for key, value in state.items():
         if not isinstance(value, torch.Tensor):
             raise ValueError(f"{where}: {key} is a {type(value).__name__}, not a tensor")
-        if not value.is_floating_point():
-            raise ValueError(f"{where}: {key} holds {value.dtype}, not floating-point weights")
     return state
 
 
@@ -106,7 +112,7 @@ def _read_torch(path: Path) -> object:
         raise ValueError(
             f"{path}: refused, it holds more than tensors and would run code, or is damaged ({_first_line(error)})"
         ) from None
-    except (RuntimeError, EOFError, OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+    except DAMAGED as error:
         raise ValueError(
             f"{path}: truncated, or not a torch file ({path.stat().st_size} bytes: {_first_line(error)})"
         ) from None

@@ -74,6 +74,10 @@ def test_processor_errors():
     processor = VggtImageProcessorPil()
     with pytest.raises(ValueError, match="NaN"):
         processor(np.full((28, 28, 3), np.nan, dtype=np.float32), do_resize=False)
+    with pytest.raises(ValueError, match="do_rescale=False"):
+        processor(np.full((28, 28, 3), 0.5, dtype=np.float32))
+    pixels = processor(np.full((28, 28, 3), 0.5, dtype=np.float32), do_rescale=False, do_resize=False)["pixel_values"]
+    assert (pixels[0] == 0.5).all()
     with pytest.raises(ValueError, match="normalises inside"):
         processor(picture(28, 28), do_normalize=True, image_mean=[0.5] * 3, image_std=[0.5] * 3)
     with pytest.raises(ValueError, match=r"different sizes \(322x644, 476x644\)"):

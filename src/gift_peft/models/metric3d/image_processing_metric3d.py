@@ -157,7 +157,9 @@ def _check(image: np.ndarray, do_rescale: bool) -> None:
     if not np.isfinite(image).all():
         raise ValueError("a picture has NaN or infinite values")
     if not do_rescale and 0 < image.max() <= 1:
-        raise ValueError("a picture has floats up to 1: Metric3D takes values from 0 to 255, multiply by 255")
+        raise ValueError(
+            "a picture has floats up to 1: Metric3D takes values from 0 to 255, multiply by 255 and round"
+        )
 
 
 def _placement(image: tuple[int, int], canvas: tuple[int, int]) -> tuple[int, int, int, int]:

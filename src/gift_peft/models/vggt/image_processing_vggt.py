@@ -32,8 +32,8 @@ class VggtImageProcessorKwargs(ImagesKwargs, total=False):
 class VggtImageProcessorPil(PilBackend):
     """Image processor of [`VggtForDepthEstimation`], on Pillow and numpy.
 
-    Transparent pixels become white. Raises ValueError for pictures that are not three-channel, are not finite, or
-    come out in different sizes, and for `do_normalize=True`.
+    Transparent pixels become white. Raises ValueError for pictures that are not three-channel, are not finite, are
+    floats in 0 to 1 with `do_rescale`, or come out in different sizes, and for `do_normalize=True`.
     """
 
     valid_kwargs = VggtImageProcessorKwargs
@@ -70,7 +70,7 @@ class VggtImageProcessorPil(PilBackend):
             raise ValueError(f"size must have height and width, got {size}")
         processed = []
         for image in images:  # (C, H, W)
-            _check(image)
+            _check(image, do_rescale)
             if do_resize and keep_aspect_ratio:
                 image = self._resize_kept(image, (size.height, size.width), resample, ensure_multiple_of, do_pad)
             elif do_resize:
@@ -146,11 +146,13 @@ def kept_size(image: tuple[int, int], size: tuple[int, int], multiple: int, insi
     return min(height, size[0]) if inside else height, size[1]
 
 
-def _check(image: np.ndarray) -> None:
+def _check(image: np.ndarray, do_rescale: bool) -> None:
     if image.ndim != 3 or image.shape[0] != 3:
         raise ValueError(f"a picture must have three channels, got an array of shape {image.shape} (channels first)")
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise ValueError("a picture has NaN or infinite values")
+    if image.dtype.kind == "f" and do_rescale and 0 < image.max() <= 1:
+        raise ValueError("a picture has floats up to 1, which would be divided by 255 again: pass do_rescale=False")
 
 
 def _resize_depth(depth: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:

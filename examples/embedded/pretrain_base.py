@@ -57,21 +57,10 @@ def build_model() -> DepthAnythingForDepthEstimation:
             depth_estimation_type="relative",
         )
     )
-    fresh_output(model)
+    with torch.no_grad():  # start from a plausible constant, away from the final ReLU's dead side
+        model.head.conv3.weight.abs_()
+        model.head.conv3.bias.fill_(0.3)
     return model
-
-
-@torch.no_grad()
-def fresh_output(model) -> None:
-    """A new last pair of convolutions whose output falls from 1.5 as its features grow.
-
-    Far things then have the large features, so an adapter moves what is far more easily than what is near: something
-    seen through glass is pulled to the glass sooner than its visible surface is pushed away.
-    """
-    for layer in (model.head.conv2, model.head.conv3):
-        layer.reset_parameters()
-    model.head.conv3.weight.abs_().neg_()
-    model.head.conv3.bias.fill_(1.5)
 
 
 def build_processor() -> DPTImageProcessor:
@@ -168,7 +157,6 @@ def main():
     parser.add_argument("--learning_rate", type=float, default=1.2e-3)
     parser.add_argument("--scenes", type=int, help="use the first so many scenes only; default: all")
     parser.add_argument("--init", type=Path, help="start from this model instead of from scratch")
-    parser.add_argument("--fresh_output", action="store_true", help="with --init: begin with a new output layer")
     parser.add_argument("--held_out", type=int, default=100, help="scenes")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
@@ -179,8 +167,6 @@ def main():
     test = load(paths[: args.held_out])
     torch.manual_seed(args.seed)
     model = DepthAnythingForDepthEstimation.from_pretrained(args.init) if args.init else build_model()
-    if args.fresh_output:
-        fresh_output(model)
     model = model.to(memory_format=torch.channels_last)  # convolutions are faster so
     average = build_model().to(memory_format=torch.channels_last)
     average.load_state_dict(model.state_dict())

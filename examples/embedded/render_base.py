@@ -59,16 +59,15 @@ def opaque_scene(rng):
 
 
 def near_scene(rng):
-    """A room as planned for a group, with an opaque twin, or an empty frame, in the target's place; its centre."""
+    """A room as planned for a group, with an opaque twin in the target's place; its centre."""
     import render_groups
 
     kind = rng.choice(["mirror", "pane", "solid"], p=[0.3, 0.3, 0.4])
     planned = None
     while planned is None:
-        planned = render_groups.plan(rng, kind, 1.0)
+        planned = render_groups.plan(rng, kind)
     scene, target = planned
-    if kind == "solid" or rng.random() < 0.7:  # else an empty frame: what is seen in it is really there
-        scene.items.append(render_groups.opaque(rng, target))
+    scene.items.append(render_groups.opaque(rng, target))
     if rng.random() < 0.5:
         render_groups.decoys(rng, scene, target)
     return scene, target.centre

@@ -19,7 +19,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rooms
-import shapes
 import targets
 import textures
 from PIL import Image
@@ -28,19 +27,17 @@ from tqdm import tqdm
 KINDS = {"mirror": "mirror", "pane": "transparent", "solid": "transparent"}
 SPLITS = {"train": {"mirror": 28, "pane": 26, "solid": 26}, "validation": {"mirror": 8, "pane": 8, "solid": 8}}
 DUST = 0.12, 0.3  # share of light that the film on a mirror or glass scatters
-REAR = 2.0, 4.0  # metres of the room behind the camera, for a mirror to show
-OPENINGS = 0.3  # doors are mostly closed when a group is taken: this share of the usual doorways and windows
 FIRST_SEED = {"train": 0, "validation": 500_000}
 
 
-def clutter(rng, count, x_range, y_range) -> list[shapes.Item]:
+def clutter(rng, count, x_range, y_range) -> list[rooms.Item]:
     """Things that somebody carries into the room for one observation."""
     items = []
     for _ in range(count):
         x, y = rng.uniform(*x_range), rng.uniform(*y_range)
         if rng.random() < 0.4:
             size = rng.uniform((0.2, 0.15, 0.4), (0.7, 0.5, 1.8))
-            items.append(shapes.box((x, y, size[2] / 2), size, rooms.twin_texture(rng), rng.uniform(-0.8, 0.8)))
+            items.append(rooms.box((x, y, size[2] / 2), size, rooms.twin_texture(rng), rng.uniform(-0.8, 0.8)))
         else:
             items += rooms.furniture(rng, x, y)
     return items
@@ -51,14 +48,14 @@ def printed(rng) -> np.ndarray:
     return textures.card(rng) if rng.random() < 0.3 else textures.mottled(rng, textures.colour(rng, 0.1, 0.9), 0.05)
 
 
-def sheet(rng, flat: targets.Flat, offset: float) -> list[shapes.Item]:
+def sheet(rng, flat: targets.Flat, offset: float) -> list[rooms.Item]:
     """Paper or card on the target's plane, `offset` metres towards the camera; mostly over all of it."""
     u, v, centre = flat.u, flat.v, flat.centre + flat.normal * offset
     if rng.random() < 0.1:
         share = rng.uniform(0.6, 0.9)
         centre = centre + rng.choice([-1, 1]) * (1 - share) * u
         u = u * share
-    return [shapes.quad(centre, u, v, printed(rng))]
+    return [rooms.quad(centre, u, v, printed(rng))]
 
 
 def smudges(rng, scene, flat: targets.Flat) -> np.ndarray:
@@ -90,26 +87,23 @@ def fresnel(scene, flat: targets.Flat) -> np.ndarray:
     return 2 * face / (1 + face)
 
 
-def plan(rng, kind: str, openings: float):
-    """A furnished room around one target and opaque siblings of it, the camera turned to them.
-
-    `openings` scales how often a doorway or window can be seen.
-    """
+def plan(rng, kind: str):
+    """A furnished room around one target and opaque siblings of it, the camera turned to them."""
     if kind == "mirror" and rng.random() < 0.45:
-        scene = rooms.make_room(rng, (2.0, 3.2), REAR, openings)
+        scene = rooms.make_room(rng, (2.0, 3.2))
         target = targets.wall_panel(rng, scene)
     elif kind == "mirror":
-        scene = rooms.make_room(rng, (2.6, 5.0), REAR, openings)
+        scene = rooms.make_room(rng, (2.6, 5.0))
         target = targets.standing_panel(rng, scene, False, 2.3)
     elif kind == "pane":
-        scene = rooms.make_room(rng, (4.2, 7.0), openings=openings)
+        scene = rooms.make_room(rng, (3.6, 6.0))
         target = targets.standing_panel(rng, scene, True, 2.3)
         if target is not None and len(target.holder) == 2:  # frameless: the cut edge of the glass is green
             rim = targets.border(rng, target.centre, target.u, target.v, 0.014, 0.012)
             tone = np.array([0.06, 0.16, 0.1], np.float32) * rng.uniform(0.6, 1.8)
-            target.holder += [shapes.Item(bar.shape, tone, bar.points) for bar in rim]
+            target.holder += [rooms.Item(bar.shape, tone, bar.points) for bar in rim]
     else:
-        scene = rooms.make_room(rng, (2.8, 5.5), openings=openings)
+        scene = rooms.make_room(rng, (2.8, 5.5))
         target = targets.table_object(rng, scene)
     if target is None:
         return None
@@ -134,19 +128,13 @@ def plan(rng, kind: str, openings: float):
     return scene, target
 
 
-def faded(rng, print_) -> np.ndarray:
-    """A photographic print that light and dust have bleached."""
-    veil = rng.uniform(0.2, 0.55)
-    return ((1 - veil) * print_ + veil * textures.paint(rng, 0.6, 0.88)).astype(np.float32)
-
-
-def opaque(rng, twin) -> shapes.Item:
+def opaque(rng, twin) -> rooms.Item:
     """The surface of an opaque sibling: sprayed, one colour, printed, or a photograph of another room."""
     import tracer
 
     kind = rng.choice(["treated", "printed", "twin", "photo"], p=[0.3, 0.3, 0.2, 0.2])
     if kind == "photo":
-        look = faded(rng, tracer.photo(rng))
+        look = tracer.photo(rng)
     else:
         look = {"treated": targets.treated, "printed": printed, "twin": rooms.twin_texture}[kind](rng)
     if isinstance(twin, targets.Flat):
@@ -219,13 +207,13 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light, matte):
     x, y, z = target.base
     ahead = np.array([x, y]) / np.hypot(x, y)
     moved = []
-    if rng.random() < 0.4:
-        aside = np.array([-ahead[1], ahead[0]]) * rng.uniform(-0.3, 0.3)
-        spot = np.array([x, y]) + ahead * rng.uniform(0.32, 0.6) + aside
+    for _ in range(rng.integers(0, 3)):
+        spot = (
+            np.array([x, y])
+            + ahead * rng.uniform(0.32, 0.6)
+            + np.array([-ahead[1], ahead[0]]) * rng.uniform(-0.3, 0.3)
+        )
         moved += rooms.small_thing(rng, *spot, z if target.holder else 0.0, scale=0.9)
-    far = max(0.9, min(2.2, scene.room[3] - 0.6 - y))
-    (a, b) = np.array([x, y]) + ahead * rng.uniform(0.8, far)
-    moved += clutter(rng, rng.integers(0, 3), (a - 0.5, a + 0.5), (b, b + 0.3))
     if shown:
         look = printed(rng)
         body = target.body(look, float(rng.uniform(0.04, 0.15)))
@@ -255,7 +243,7 @@ def make_group(seed: int, kind: str):
     import tracer
 
     rng = np.random.default_rng([20260102, seed])
-    planned = plan(rng, kind, OPENINGS)
+    planned = plan(rng, kind)
     if planned is None:
         return None
     scene, target = planned

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import rooms
 import textures
-from rooms import Scene
-from shapes import Item, box, frame_matrix, profile, quad, turned
+from rooms import Item, Scene, box, quad
 
 
 @dataclass
@@ -44,7 +43,7 @@ class Solid:
         return self.base + np.array([0, 0, self.outline[:, 1].max() / 2])
 
     def body(self, texture: np.ndarray, gloss: float | None = None, role: str = "target") -> Item:
-        return turned(self.base, self.outline, texture, gloss=gloss, role=role)
+        return rooms.turned(self.base, self.outline, texture, gloss=gloss, role=role)
 
     def cavity(self) -> Item:
         top = self.outline[:, 1].max()
@@ -52,7 +51,7 @@ class Solid:
         inner = np.stack(
             [np.maximum(self.outline[:, 0] - wall, 1e-4), np.clip(self.outline[:, 1], wall, top - wall)], 1
         )
-        return turned(self.base, inner, np.full(3, 0.5, np.float32), role="hollow")
+        return rooms.turned(self.base, inner, np.full(3, 0.5, np.float32), role="hollow")
 
 
 def _facing(normal_yaw: float, tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -77,7 +76,7 @@ def border(rng, centre, u, v, bar: float, depth: float) -> list[Item]:
     ):
         thick = n * depth / 2
         points = np.array([middle + i * a + j * b + k * thick for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-        parts.append(Item({"type": "cube", "to_world": frame_matrix(a, b, thick, middle)}, tone, points))
+        parts.append(Item({"type": "cube", "to_world": rooms.frame_matrix(a, b, thick, middle)}, tone, points))
     return parts
 
 
@@ -150,10 +149,10 @@ def table_object(rng, scene: Scene) -> Solid | None:
         t = np.linspace(0, np.pi, 24)
         outline = np.stack([np.maximum(np.sin(t), 1e-4) * radius, (1 - np.cos(t)) * radius], 1)
     else:
-        outline = profile(rng, kind, scale * rng.uniform(0.25, 0.42), scale * rng.uniform(0.14, 0.26))
+        outline = rooms.profile(rng, kind, scale * rng.uniform(0.25, 0.42), scale * rng.uniform(0.14, 0.26))
     offset = np.zeros(2) if on_floor else rng.uniform(-0.1, 0.1, 2)
     base = np.array([spot[0] + offset[0], spot[1] + offset[1], z])
-    return Solid(base, outline, holder, bool(rng.random() < 0.8))
+    return Solid(base, outline, holder, bool(rng.random() < 0.5))
 
 
 def moved(items: list[Item], shift: np.ndarray) -> list[Item]:

@@ -14,8 +14,7 @@ import mitsuba as mi
 import numpy as np
 import rooms
 import textures
-from rooms import FIELD_OF_VIEW, Camera, Scene
-from shapes import Item
+from rooms import FIELD_OF_VIEW, Camera, Item, Scene
 
 mi.set_variant("scalar_rgb")
 drjit.set_thread_count(1)  # the scripts run one process a core

@@ -82,6 +82,10 @@ def test_processor_errors():
         ([(30, 40)], [float("nan")], "positive"),
         ([(30, 40)], [None], "positive"),
         ([(30, 40)], [1, 2], "2 focal lengths for 1"),
+        ([(30, 40)], 500.0, "focal lengths: a list, one per picture"),
+        (torch.tensor(30), None, "target sizes: a list, one per picture"),
+        ([(0, 40)], None, "a target size is"),
+        ([(30, 40, 3)], None, "a target size is"),
     ):
         with pytest.raises(ValueError, match=message):
             processor.post_process_depth_estimation(output, sizes, focal)

@@ -101,7 +101,11 @@ class Metric3DImageProcessorPil(PilBackend):
         """
         depths = outputs.predicted_depth
         for name, values in (("target sizes", target_sizes), ("focal lengths", focal_lengths)):
-            if values is not None and len(values) != len(depths):
+            if values is None:
+                continue
+            if not hasattr(values, "__len__") or getattr(values, "ndim", 1) == 0:
+                raise ValueError(f"{name}: a list, one per picture, got {values!r}")
+            if len(values) != len(depths):
                 raise ValueError(f"{len(values)} {name} for {len(depths)} predictions")
         if target_sizes is None:
             if focal_lengths is not None:
@@ -109,6 +113,8 @@ class Metric3DImageProcessorPil(PilBackend):
             return [{"predicted_depth": depth} for depth in depths]
         results = []
         for index, (depth, target) in enumerate(zip(depths, target_sizes, strict=True)):
+            if len(target) != 2 or min(target) < 1:
+                raise ValueError(f"a target size is (height, width) in pixels, got {target!r}")
             size = int(target[0]), int(target[1])
             depth = self._content(depth, size)
             depth = F.interpolate(depth[None, None], size=size, mode="bilinear", align_corners=False)[0, 0]

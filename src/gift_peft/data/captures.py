@@ -104,8 +104,8 @@ def prepare(
         license, pretty_name (`str`): for the dataset card.
 
     Raises:
-        ValueError, FileNotFoundError: one line; `raw` or `out` is not what it should be. What concerns one group
-            never raises.
+        ValueError, FileNotFoundError: one line; `raw` or `out` is not what it should be, or another run is at work
+            in `out`. What concerns one group never raises.
     """
     raw, out = Path(raw), Path(out)
     settings = settings or PrepareSettings()

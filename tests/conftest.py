@@ -9,6 +9,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import datasets
 import pytest
 import torch
+from group_tools import DTYPES, gift_model
 from records import records
 from runs import arguments
 from tiny import tiny_model, write_base, write_raw_tree
@@ -31,6 +32,12 @@ def cache_home(tmp_path_factory):
 def model():
     """A fresh tiny Depth Anything, float32, eval."""
     return tiny_model()
+
+
+@pytest.fixture(scope="module", params=DTYPES)
+def model_of(request):
+    """The tiny model with an adapter, in float64 and in float32; shared within a file."""
+    return gift_model(DTYPES[request.param])
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,6 @@ from group_tools import (
     COUNTS,
     CUTS,
     DEAD,
-    DTYPES,
     Toy,
     autograd_gradients,
     gift_model,
@@ -30,11 +29,6 @@ from torch import nn
 from gift_peft.adapters import get_gift_model
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import gift_loss
-
-
-@pytest.fixture(scope="module", params=DTYPES)
-def model_of(request):
-    return gift_model(DTYPES[request.param])
 
 
 @pytest.mark.parametrize("cut", CUTS)

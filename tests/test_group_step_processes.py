@@ -26,12 +26,6 @@ from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.group_step import GroupStep
 from gift_peft.training.teacher import make_proxies
 
-
-@pytest.fixture(scope="module", params=DTYPES)
-def model_of(request):
-    return gift_model(DTYPES[request.param])
-
-
 UPDATES = 20
 
 

@@ -1,28 +1,16 @@
-"""`evaluate_gift_i` on groups whose predictions are known to the pixel, and end to end on a tiny raw tree."""
+"""`evaluate_gift_i` on groups whose predictions are known to the pixel: rows, summaries, GCE, collapse and counts."""
 
 import json
 import math
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from accelerate import debug_launcher
-from booster_tree import bilinear
-from PIL import Image
-from tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
 
-from gift_peft.adapters import get_gift_model
-from gift_peft.data.gift_i import load_gift_i
 from gift_peft.data.preprocess import Group
-from gift_peft.data.writer import write_gift_i
-from gift_peft.evaluation.evaluate import evaluate_gift_i, run_evaluation
-from gift_peft.evaluation.panels import group_panels
+from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.results import REGIONS, GiftIReport
 from gift_peft.evaluation.scoring import consensus
-from gift_peft.evaluation.tables import text_table
-from gift_peft.training.teacher import make_proxies
 
 H, W = 6, 8
 
@@ -218,23 +206,6 @@ def test_missing_references_and_empty_targets_are_counted_not_averaged():
     assert report.gce["num_groups"] == 2
 
 
-def test_unknown_depth_all_over_the_target_is_counted(tmp_path):
-    rng = np.random.default_rng(5)
-    mask = np.zeros((28, 28), bool)
-    mask[5:20, 5:20] = True
-    depth = rng.integers(500, 900, (28, 28)).astype(np.uint16)
-    blind = np.where(mask, 0, depth).astype(np.uint16)  # a depth camera sees nothing on glass
-    pictures = [Image.fromarray(rng.integers(0, 255, (28, 28, 3), dtype=np.uint8)) for _ in range(3)]
-    group = {"split": "validation", "group_id": "g", "surface": "transparent", "masks": [mask, mask, mask | True]}
-    write_gift_i([group | {"images": pictures, "depths": [depth, blind, depth]}], tmp_path, license="cc0-1.0")
-    report = evaluate(
-        load_gift_i(tmp_path, "validation"), reference="depth", kind="depth", processor=tiny_processor(), size=(28, 28)
-    )
-    assert (report.counts["scored"], report.counts["without_tom"], report.counts["without_other"]) == (3, 1, 1)
-    assert report.by_surface["transparent"]["num_images"] == 2
-    assert "1 without known target pixels, 1 with nothing else" in text_table(report)
-
-
 def test_protocols_that_do_not_fit_the_reference_are_refused():
     with pytest.raises(ValueError, match='protocol gift aligns to depth in mm; proxies are in native units: use "nat'):
         evaluate([make_group(0)], protocol="gift")
@@ -310,133 +281,6 @@ def test_bad_predictions_and_arguments_are_named():
         evaluate([group], reference="depth", kind="depth")
 
 
-# ---- true depth ----
-
-
-def depth_tree(folder, size, seed=0):
-    """A prepared validation split of one group of two pictures with true depth in mm; 0 in a corner."""
-    rng = np.random.default_rng(seed)
-    depths = rng.integers(500, 5000, (2, *size)).astype(np.uint16)
-    depths[:, 0, 0] = 0
-    masks = [np.pad(np.ones((size[0] - 4, size[1] - 4), bool), 2)] * 2
-    images = [Image.fromarray(rng.integers(0, 255, (*size, 3), dtype=np.uint8)) for _ in range(2)]
-    group = {"split": "validation", "group_id": "g", "images": images, "masks": masks, "depths": list(depths)}
-    write_gift_i([group | {"surface": "mirror"}], folder, license="cc0-1.0")
-    return load_gift_i(folder, "validation"), depths
-
-
-def test_a_perfect_disparity_model_has_no_error_against_depth(tmp_path):
-    dataset, depths = depth_tree(tmp_path, SIZE)
-    disparity = torch.from_numpy(7000.0 / np.maximum(depths, 1).astype(np.float64) + 3).float()
-    report = evaluate(
-        dataset, lambda pixels: disparity, None, reference="depth", kind="inverse_depth", processor=tiny_processor(),
-        size=SIZE,
-    )  # fmt: skip
-    assert report.protocol["name"] == "gift" and report.unit == "mm"
-    for region in REGIONS:
-        assert report.summary[region]["rmse"] < 0.5 and report.summary[region]["delta1"] == 100
-    wrong = evaluate(
-        dataset, lambda pixels: disparity, None, reference="depth", kind="depth", processor=tiny_processor(), size=SIZE
-    )
-    assert wrong.summary["all"]["rmse"] > 100
-
-
-def test_depth_is_scored_on_its_own_grid_with_the_masks_drawn_there(tmp_path):
-    dataset, depths = depth_tree(tmp_path, (30, 40))
-    small = torch.rand(2, *SIZE, generator=torch.Generator().manual_seed(0)) + 1
-    report = evaluate(
-        dataset, lambda pixels: small, None, reference="depth", kind="depth", processor=tiny_processor(), size=SIZE
-    )
-    row = report.rows[1]
-    assert row["target_pixels"] == 26 * 36
-    resized = bilinear(small[1].double().numpy(), (30, 40))
-    known = depths[1] > 0
-    columns = np.stack([resized[known], np.ones(known.sum())], 1)
-    scale, shift = np.linalg.lstsq(columns, depths[1][known].astype(float), rcond=None)[0]
-    error = np.abs(np.clip(scale * resized + shift, 1, 10000) - depths[1])
-    assert row["base"]["all"]["mae"] == pytest.approx(error[known].mean(), rel=1e-6)
-    assert row["base"]["tom"]["mae"] == pytest.approx(error[2:-2, 2:-2].mean(), rel=1e-6)
-
-
-# ---- end to end on the tiny model ----
-
-
-@pytest.fixture
-def adapter_model(base_dir):
-    from transformers import AutoModelForDepthEstimation
-
-    torch.manual_seed(0)
-    return get_gift_model(AutoModelForDepthEstimation.from_pretrained(base_dir), rank=2)
-
-
-def shake(model):
-    """Give every trainable weight of an adapter a small random change."""
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for weight in model.parameters():
-            if weight.requires_grad:
-                weight += 0.02 * torch.randn(weight.shape, generator=generator)
-    return model
-
-
-def test_an_identity_adapter_is_the_base_to_the_bit(raw_tree, adapter_model):
-    report = evaluate_gift_i(load_gift_i(raw_tree, "validation"), adapter_model, size=SIZE, progress=False)
-    assert report.summary == report.base
-    assert report.gce["adapted"] == report.gce["base"] > 0
-    assert report.collapse == {"target_mean_ratio": 1, "spread_ratio": 1, "alarm": False}
-    assert all(row["base"] == row["adapted"] for row in report.rows)
-
-
-def test_stored_proxies_and_those_made_on_the_way_agree(raw_tree, base_dir, adapter_model):
-    shake(adapter_model)
-    made = evaluate_gift_i(load_gift_i(raw_tree, "validation"), adapter_model, size=SIZE, progress=False)
-    make_proxies(base_dir, raw_tree, splits=["validation"], size=SIZE)
-    stored = load_gift_i(raw_tree, "validation", teacher=base_dir)
-    assert evaluate_gift_i(stored, adapter_model, progress=False).to_dict() == made.to_dict()
-    assert made.summary != made.base
-    stored_base = evaluate_gift_i(stored, tiny_model(), processor=tiny_processor(), progress=False)
-    assert stored_base.base == made.base
-
-
-def test_modes_and_gradients_are_left_as_they_were(raw_tree, adapter_model):
-    adapter_model.train()
-    adapter_model.base_model.model.head.eval()
-    frozen = next(weight for name, weight in adapter_model.named_parameters() if "lora_A" in name)
-    frozen.requires_grad_(False)
-    modes = [module.training for module in adapter_model.modules()]
-    flags = [weight.requires_grad for weight in adapter_model.parameters()]
-    evaluate_gift_i(
-        load_gift_i(raw_tree, "validation"), adapter_model, processor=tiny_processor(), size=SIZE, progress=False
-    )
-    assert [module.training for module in adapter_model.modules()] == modes
-    assert [weight.requires_grad for weight in adapter_model.parameters()] == flags
-
-
-def test_the_train_split_has_gce_and_no_accuracy(raw_tree, adapter_model):
-    report = evaluate_gift_i(load_gift_i(raw_tree, "train"), shake(adapter_model), size=SIZE, progress=False)
-    assert report.gce["num_groups"] == 2 and report.counts["scored"] == 0 and report.counts["images"] == 5
-
-
-def test_run_evaluation_prints_and_writes(raw_tree, base_dir, tmp_path, adapter_model, capsys):
-    from gift_peft.adapters import save_adapter
-
-    adapter = tmp_path / "adapter"
-    with pytest.warns(UserWarning, match="local"):
-        save_adapter(shake(adapter_model), adapter, str(base_dir), processor=tiny_processor(), size=SIZE)
-    out = tmp_path / "out"
-    report = run_evaluation(base_dir, raw_tree, adapter, out=out, progress=False)
-    printed = capsys.readouterr().out
-    assert re.search(r"^ToM +base ", printed, re.MULTILINE) and "consensus" in printed
-    assert "Protocol native" in printed and "\x1b" not in printed
-    assert {path.name for path in out.iterdir()} == {"metrics.json", "rows.jsonl", "report.md"}
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["summary"] == report.summary and metrics["about"]["size"] == list(SIZE)
-    rows = [json.loads(line) for line in (out / "rows.jsonl").read_text().splitlines()]
-    assert rows == report.rows and len(rows) == 2
-    same = run_evaluation(base_dir, raw_tree, adapter, adapter_scale=0, out=out, progress=False)
-    assert same.summary == same.base == report.base
-
-
 def test_saved_reports_hold_no_nan_and_load_again(tmp_path):
     report = evaluate([make_group(0), make_group(1, reference=False), make_group(2, count=1)])
     folder = report.save(tmp_path / "deep" / "folder")
@@ -452,89 +296,3 @@ def test_saved_reports_hold_no_nan_and_load_again(tmp_path):
     assert {path.name for path in folder.iterdir()} == {"metrics.json", "rows.jsonl"}
     with pytest.raises(FileNotFoundError, match=r"metrics\.json is missing"):
         GiftIReport.load(tmp_path)
-
-
-def _evaluate_in_two_processes(raw, out):
-    from accelerate import Accelerator
-    from accelerate.state import AcceleratorState
-
-    AcceleratorState._reset_state(reset_partial_state=True)  # the parent's tests may have made one before the fork
-    accelerator = Accelerator(cpu=True)
-    model = shake_alone()
-    report = evaluate_gift_i(
-        load_gift_i(raw, "validation"),
-        model,
-        processor=tiny_processor(),
-        size=SIZE,
-        accelerator=accelerator,
-        progress=False,
-    )
-    report.save(out / str(accelerator.process_index))
-
-
-def shake_alone():
-    torch.manual_seed(0)
-    return shake(get_gift_model(tiny_model(), rank=2, head="none"))
-
-
-def test_two_processes_give_the_report_of_one(tmp_path):
-    raw = write_raw_tree(tmp_path / "raw", validation=(2, 3, 2))
-    debug_launcher(_evaluate_in_two_processes, (raw, tmp_path), num_processes=2)
-    one, two = (GiftIReport.load(tmp_path / rank) for rank in "01")
-    assert one.to_dict() == two.to_dict() and one.rows == two.rows
-    assert [row["group_id"] for row in one.rows] == [f"scene_{100 + g}" for g in (0, 0, 1, 1, 1, 2, 2)]
-    alone = evaluate_gift_i(raw, shake_alone(), processor=tiny_processor(), size=SIZE, progress=False)
-    assert alone.to_dict() == one.to_dict()
-
-
-def test_paths_and_model_ids_are_accepted(raw_tree, base_dir, tmp_path):
-    other = write_base(tmp_path / "other", seed=1)
-    from gift_peft.evaluation.predict import load_model
-
-    report = evaluate_gift_i(raw_tree, load_model(other, size=SIZE).model, str(base_dir), size=SIZE, progress=False)
-    expected = evaluate_gift_i(raw_tree, tiny_model(), processor=tiny_processor(), size=SIZE, progress=False)
-    assert report.base == expected.base and report.summary != report.base
-
-
-def test_panels_hold_an_observation_on_the_reference_grid(tmp_path):
-    dataset, depths = depth_tree(tmp_path, (30, 40))
-    options = {"processor": tiny_processor(), "size": SIZE, "kind": "inverse_depth"}
-    (panel,) = group_panels(dataset[0], {1: "mirror"}, tiny_model(1), tiny_model(), **options)
-    assert panel.label == "mirror"
-    assert panel.base.shape == panel.adapted.shape == panel.target.shape == (30, 40)
-    np.testing.assert_array_equal(panel.reference, depths[1])
-    assert panel.image.size == (40, 30) and panel.target.sum() == 26 * 36 and panel.protocol == "gift"
-    assert not np.array_equal(panel.base, panel.adapted)
-    with pytest.raises(ValueError, match="group g has no proxy"):
-        group_panels(dataset[0], {0: "x"}, tiny_model(1), tiny_model(), reference="proxy", **options)
-
-
-CLEARGRASP = Path(__file__).parents[2] / "shared" / "data" / "cleargrasp_d435"
-
-
-@pytest.mark.skipif(not CLEARGRASP.is_dir(), reason="the ClearGrasp sample scenes are not beside the repository")
-def test_real_scenes_with_a_treated_reference_and_measured_depth(tmp_path):
-    scenes = [folder for folder in sorted(CLEARGRASP.iterdir()) if folder.is_dir()]
-    groups = [
-        {
-            "split": "validation",
-            "group_id": scene.name,
-            "surface": "transparent",
-            "images": [scene / "transparent.jpg"],
-            "masks": [scene / "mask.png"],
-            "depths": [scene / "opaque_depth_mm.png"],
-            "reference": scene / "opaque_sprayed.jpg",
-        }
-        for scene in scenes
-    ]
-    write_gift_i(groups, tmp_path, license="other")
-    dataset = load_gift_i(tmp_path, "validation")
-    options = {"processor": tiny_processor(), "size": SIZE, "progress": False}
-    for reference, protocol in (("proxy", "native"), ("depth", "gift")):
-        report = evaluate_gift_i(dataset, tiny_model(1), tiny_model(), reference=reference, **options)
-        assert report.protocol["name"] == protocol and report.counts["scored"] == 2
-        assert (report.gce["num_groups"], report.gce["num_skipped"]) == (0, 2)
-        # With one observation the median is the observation itself.
-        assert report.consensus == report.base and report.summary != report.base
-    assert 10 < report.base["all"]["mae"] < 1000  # mm, of scenes less than two metres deep
-    assert report.rows[0]["target_pixels"] == int((np.asarray(dataset[0]["masks"][0]) > 0).sum())

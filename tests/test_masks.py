@@ -1,4 +1,4 @@
-"""Masks in every form: decoders against straight-line oracles, and what `find_mask` takes and refuses."""
+"""What `find_mask` takes and refuses: masks in every form, in every place, and broken ones."""
 
 import base64
 import copy
@@ -9,133 +9,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drawn_masks import (
+    BOX,
+    CORNERS,
+    POLYGON,
+    SIZE,
+    coco,
+    compressed,
+    labelme,
+    packed,
+    percent,
+    picture,
+    region,
+    run_lengths,
+    tasks,
+)
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from PIL import Image
 
-from gift_peft.data.annotations import coco_mask, ellipse_points, label_studio_mask, polygon_mask, rectangle_points
 from gift_peft.data.masks import MaskSource, find_mask, is_mask_file
-
-SIZE = (12, 8)  # width, height
-BOX = np.zeros(SIZE[::-1], bool)
-BOX[2:6, 3:9] = True
-CORNERS = [[3, 2], [9, 2], [9, 6], [3, 6]]
-
-
-# ---- decoders ----
-
-
-def inside(x: float, y: float, corners) -> bool | None:
-    """Even-odd rule for one point, by its crossings with a ray to the right; None if it lies on an edge."""
-    odd = False
-    for (x0, y0), (x1, y1) in zip(corners, corners[1:] + corners[:1], strict=True):
-        if (y0 <= y) != (y1 <= y):
-            distance = x0 + (y - y0) / (y1 - y0) * (x1 - x0) - x
-            if abs(distance) < 1e-9:
-                return None
-            odd ^= distance < 0
-    return odd
-
-
-# Multiples of an odd fraction: a corner is never level with a pixel's centre.
-coordinate = st.integers(-400, 1500).map(lambda value: value / 77)
-
-
-@given(st.lists(st.tuples(coordinate, coordinate), min_size=3, max_size=8))
-def test_polygon_is_the_pixels_whose_centres_it_holds(corners):
-    for mask in (polygon_mask(corners, SIZE), polygon_mask(corners[::-1], SIZE)):
-        for y, x in np.ndindex(mask.shape):
-            assert inside(x + 0.5, y + 0.5, corners) in (None, mask[y, x])
-
-
-@given(coordinate, coordinate)
-def test_polygons_that_share_an_edge_cover_every_pixel_once(x, y):
-    middle = (x, y)
-    border = [(-30, -30), (50, -30), (50, 50), (-30, 50)]
-    parts = [polygon_mask([middle, border[k], border[(k + 1) % 4]], SIZE).astype(int) for k in range(4)]
-    if -30 < x < 50 and -30 < y < 50:
-        np.testing.assert_array_equal(sum(parts), 1)
-
-
-def test_rectangles_and_ellipses():
-    np.testing.assert_array_equal(polygon_mask(rectangle_points(3, 2, 6, 4), SIZE), BOX)
-    np.testing.assert_array_equal(polygon_mask(rectangle_points(9, 6, -6, -4), SIZE), BOX)
-    np.testing.assert_array_equal(polygon_mask(rectangle_points(9, 2, 4, 6, 90), SIZE), BOX)  # turned clockwise
-    circle = polygon_mask(ellipse_points(50, 50, 30, 30), (100, 100))
-    assert abs(circle.sum() - np.pi * 900) < 15
-    tall = polygon_mask(ellipse_points(50, 50, 40, 10, 90), (100, 100))
-    assert abs(tall.sum() - np.pi * 400) < 15 and tall[15, 50] and not tall[50, 15]
-
-
-def run_lengths(mask: np.ndarray) -> list[int]:
-    counts, value, length = [], False, 0
-    for pixel in mask.T.ravel():
-        if pixel != value:
-            counts.append(length)
-            value, length = pixel, 0
-        length += 1
-    return [*counts, length]
-
-
-def compressed(counts: list[int]) -> str:
-    text = ""
-    for index, count in enumerate(counts):
-        number = count - counts[index - 2] if index > 2 else count
-        while True:
-            low, number = number & 31, number >> 5
-            more = number != (-1 if low & 16 else 0)
-            text += chr(48 + low + 32 * more)
-            if not more:
-                break
-    return text
-
-
-@given(arrays(bool, st.tuples(st.integers(1, 40), st.integers(1, 40))))
-def test_run_lengths_give_the_mask_back(mask):
-    height, width = mask.shape
-    counts = run_lengths(mask)
-    for form in (counts, compressed(counts)):
-        decoded = coco_mask({"segmentation": {"size": [height, width], "counts": form}}, (width, height))
-        np.testing.assert_array_equal(decoded, mask)
-
-
-def test_run_lengths_as_pycocotools_writes_them():
-    mask = np.zeros((3, 4), bool)
-    mask[1, 1:3] = True
-    np.testing.assert_array_equal(coco_mask({"segmentation": {"size": [3, 4], "counts": "41202"}}, (4, 3)), mask)
-
-
-def packed(values: np.ndarray, runs: bool) -> list[int]:
-    """Label Studio's brush stream, either one long run a stretch of equal values, or singles only."""
-    bits = f"{len(values):032b}{7:05b}" + "".join(f"{size - 1:04b}" for size in (2, 4, 8, 16))
-    place = 0
-    while place < len(values):
-        end = place + 1
-        while end < len(values) and end - place < 300 and (not runs or values[end] == values[place]):
-            end += 1
-        bits += f"{int(runs)}11{end - place - 1:016b}"
-        bits += "".join(f"{value:08b}" for value in (values[place : place + 1] if runs else values[place:end]))
-        place = end
-    bits += "0" * (-len(bits) % 8)
-    return [int(bits[start : start + 8], 2) for start in range(0, len(bits), 8)]
-
-
-@given(arrays(bool, (8, 12)), st.booleans())
-def test_brush_strokes_give_the_mask_back(mask, runs):
-    values = np.repeat(mask.astype(np.uint8)[..., None] * 255, 4, axis=2).ravel()
-    np.testing.assert_array_equal(label_studio_mask(region("brushlabels", rle=packed(values, runs)), SIZE), mask)
-
-
-def region(kind="polygonlabels", label="glass", **value) -> dict:
-    return {"type": kind, "original_width": SIZE[0], "original_height": SIZE[1], "value": {kind: [label], **value}}
-
-
-def percent(points):
-    return [[100 * x / SIZE[0], 100 * y / SIZE[1]] for x, y in points]
-
-
-# ---- files ----
 
 
 @pytest.fixture
@@ -160,39 +53,6 @@ def write(path: Path, content) -> Path:
     return path
 
 
-def picture(mask=BOX) -> np.ndarray:
-    return mask.astype(np.uint8) * 255
-
-
-def labelme(points=CORNERS, kind="polygon", label="glass", **more) -> dict:
-    shape = {"label": label, "points": points, "shape_type": kind, "group_id": None, "flags": {}}
-    return {
-        "version": "5.4.1",
-        "imagePath": "1.jpg",
-        "imageData": "aGVsbG8=",
-        "imageWidth": SIZE[0],
-        "imageHeight": SIZE[1],
-        "shapes": [shape],
-        **more,
-    }
-
-
-def coco(name="1.jpg", segmentation=None, **annotation) -> dict:
-    return {
-        "images": [{"id": 5, "file_name": name, "width": SIZE[0], "height": SIZE[1]}],
-        "categories": [{"id": 1, "name": "table"}, {"id": 2, "name": "glass"}],
-        "annotations": [
-            {"id": 1, "image_id": 5, "category_id": 2, "bbox": [3, 2, 6, 4], "segmentation": segmentation or []}
-            | annotation
-        ],
-    }
-
-
-def tasks(*results, image="/data/upload/3/0a1b2c3d-1.jpg", **task) -> list:
-    return [{"id": 7, "data": {"image": image}, "annotations": [{"result": list(results)}], **task}]
-
-
-POLYGON = [3, 2, 9, 2, 9, 6, 3, 6]
 GOOD = {
     "png": ("masks/1.png", picture()),
     "png of zeros and ones": ("masks/1.png", BOX.astype(np.uint8)),

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import nn
 
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation
@@ -84,6 +84,13 @@ def metric3d_golden(name: str = "golden_public") -> tuple[dict, dict, Metric3DCo
     config.pop("seed")
     weights = {key.removeprefix("weights/"): value for key, value in tensors.items() if key.startswith("weights/")}
     return tensors, weights, Metric3DConfig(**config)
+
+
+def saved_forms(state: dict, folder: Path) -> dict[str, dict | Path]:
+    """A checkpoint as a dict, a safetensors and a torch file, by what an error calls it."""
+    save_file(state, folder / "a.safetensors")
+    torch.save({"model_state_dict": state}, folder / "b.pth")
+    return {"the given dict": state, **{str(path): path for path in (folder / "a.safetensors", folder / "b.pth")}}
 
 
 def picture(height: int = 60, width: int = 80, seed: int = 0) -> Image.Image:

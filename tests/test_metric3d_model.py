@@ -1,10 +1,11 @@
 """Metric3D V2 as a transformers model: saved and loaded, checkpointed, compiled, from official files; its config."""
 
 import copy
+import math
 
 import pytest
 import torch
-from backbones import METRIC3D, metric3d_golden, tiny_metric3d
+from backbones import METRIC3D, metric3d_golden, saved_forms, tiny_metric3d
 from safetensors.torch import load_file, save_file
 
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation
@@ -271,3 +272,36 @@ def test_bad_checkpoints_end_in_one_clear_error(tmp_path, weights, capsys):
     for tensors, sizes, message in cases:
         with pytest.raises(ValueError, match=message):
             Metric3DForDepthEstimation.from_official(tensors, sizes)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
+def test_weights_that_are_not_finite_are_refused(weights, tmp_path, value):
+    state, config = weights
+    name = "depth_model.decoder.update_block.mask.2.bias"
+    bias = state[name].double()
+    bias[-1] = value
+    once = {key: tensor for key, tensor in state.items() if ".downsample.1." not in key}
+    for where, source in saved_forms(once | {name: bias}, tmp_path).items():
+        with pytest.raises(ValueError) as error:
+            Metric3DForDepthEstimation.from_official(source, config)
+        assert str(error.value) == f"{where}: {name} holds NaN or infinite values (in float32)"
+
+
+def test_nan_in_a_parameter_that_is_stored_twice_is_no_difference(weights):
+    state, config = weights
+    twice = next(key for key in state if ".downsample.1." in key)
+    broken = torch.full_like(state[twice], math.nan)
+    with pytest.raises(ValueError, match=rf"the given dict: {twice} holds NaN"):
+        Metric3DForDepthEstimation.from_official(
+            state | {twice: broken, twice.replace("downsample.1", "norm3"): broken}, config
+        )
+
+
+def test_a_tensor_with_and_without_the_prefix_is_refused(weights, tmp_path):
+    state, config = weights
+    name = "depth_model.decoder.update_block.mask.2.bias"
+    once = {key: tensor for key, tensor in state.items() if ".downsample.1." not in key}
+    for where, source in saved_forms(once | {f"module.{name}": state[name] + 1}, tmp_path).items():
+        with pytest.raises(ValueError, match=rf"(module\.)?{name} and (module\.)?{name} are two tensors") as error:
+            Metric3DForDepthEstimation.from_official(source, config)
+        assert str(error.value).startswith(f"{where}: ") and "\n" not in str(error.value)

@@ -2,13 +2,14 @@
 
 import json
 import logging
+import math
 import os
 import pickle
 from pathlib import Path
 
 import pytest
 import torch
-from backbones import FIXTURES, VGGT, images, relative, tiny_vggt, vggt_golden
+from backbones import FIXTURES, VGGT, images, relative, saved_forms, tiny_vggt, vggt_golden
 from safetensors.torch import save_file
 
 from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation
@@ -248,6 +249,27 @@ def test_checkpoints_of_another_variant(official, tmp_path):
     save_file(broken, tmp_path / "int.safetensors")
     with pytest.raises(ValueError, match=r"depth_head\.norm\.bias holds torch\.int64"):
         VggtForDepthEstimation.from_official(tmp_path / "int.safetensors", VggtConfig(**sizes))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
+def test_weights_that_are_not_finite_are_refused(official, tmp_path, value):
+    name = "depth_head.norm.bias"
+    bias = official[name].double()
+    bias[-1] = value
+    for where, source in saved_forms(official | {name: bias}, tmp_path).items():
+        with pytest.raises(ValueError) as error:
+            VggtForDepthEstimation.from_official(source, VggtConfig(**SIDECAR["config"]))
+        assert str(error.value) == f"{where}: {name} holds NaN or infinite values (in float32)"
+
+
+def test_a_tensor_with_and_without_the_prefix_is_refused(official, tmp_path):
+    name, config = "depth_head.norm.bias", VggtConfig(**SIDECAR["config"])
+    for where, source in saved_forms(official | {f"module.{name}": official[name] + 1}, tmp_path).items():
+        with pytest.raises(ValueError, match=rf"(module\.)?{name} and (module\.)?{name} are two tensors") as error:
+            VggtForDepthEstimation.from_official(source, config)
+        assert str(error.value).startswith(f"{where}: ") and "\n" not in str(error.value)
+    ignored = {"camera_head.x": torch.zeros(1), "module.camera_head.x": torch.zeros(1)}
+    VggtForDepthEstimation.from_official(official | ignored, config)
 
 
 def test_a_file_cut_anywhere_is_one_clear_error(tmp_path):

@@ -31,7 +31,8 @@ def read_official(source: str | Path | Mapping[str, torch.Tensor]) -> dict[str, 
 
     `module.` prefixes and a `model_state_dict`, `state_dict` or `model` wrapper are taken off, and of a parameter that
     is stored twice (`norm3` and `downsample.1`) the first name stays. Raises FileNotFoundError, and ValueError for a
-    file that is truncated, holds more than tensors, or is no Metric3D V2 checkpoint.
+    file that is truncated, holds more than tensors, is no Metric3D V2 checkpoint, or holds a tensor with and without
+    the prefix.
     """
     if isinstance(source, Mapping):
         return _named_tensors(source, "the given dict")
@@ -52,7 +53,7 @@ def fit_official(
 ) -> dict[str, torch.Tensor]:
     """Float32 copies of `state` for each name of `expected`; what the network never uses may be absent.
 
-    Raises ValueError naming the first tensor that one lacks or that has another shape.
+    Raises ValueError naming the first tensor that one lacks, that has another shape, or that is not finite.
     """
     optional = OPTIONAL | (OPTIONAL_GIANT2 if variant == "giant2" else {})
     hint = f"is this a checkpoint of another variant than {variant}?"
@@ -68,12 +69,19 @@ def fit_official(
     for name in state:
         if name not in expected:
             raise ValueError(f"{where}: {name} has no place in the model; {hint}")
-    return {
-        name: state[name].to(torch.float32, copy=True)
-        if name in state
-        else torch.full(tensor.shape, optional[name], dtype=torch.float32)
-        for name, tensor in expected.items()
-    }
+    fitted = {}
+    for name, tensor in expected.items():
+        if name in state:
+            fitted[name] = state[name].to(torch.float32, copy=True)
+            _check_finite(fitted[name], name, where)
+        else:
+            fitted[name] = torch.full(tensor.shape, optional[name], dtype=torch.float32)
+    return fitted
+
+
+def _check_finite(tensor: torch.Tensor, name: str, where: str) -> None:
+    if not torch.isfinite(tensor).all():
+        raise ValueError(f"{where}: {name} holds NaN or infinite values (in float32)")
 
 
 def _named_tensors(content: object, where: str) -> dict[str, torch.Tensor]:
@@ -83,7 +91,13 @@ def _named_tensors(content: object, where: str) -> dict[str, torch.Tensor]:
         content = content[inner[0]]
     if not isinstance(content, Mapping):
         raise ValueError(f"{where}: holds a {type(content).__name__}, not tensors by name")
-    named = {re.sub(r"^(module\.)+", "", str(key)): value for key, value in content.items()}
+    keys: dict[str, object] = {}
+    for key in content:
+        name = re.sub(r"^(module\.)+", "", str(key))
+        if name in keys:
+            raise ValueError(f"{where}: {keys[name]} and {key} are two tensors of one name; leave one out")
+        keys[name] = key
+    named = {name: content[key] for name, key in keys.items()}
     if WIDTH not in named:
         first = f"its first entry is {next(iter(named))!r}" if named else "it is empty"
         raise ValueError(f"{where}: not a Metric3D V2 (ViT) checkpoint, it has no {WIDTH}; {first}")
@@ -94,6 +108,7 @@ def _named_tensors(content: object, where: str) -> dict[str, torch.Tensor]:
         name = key.replace(".downsample.1.", ".norm3.")
         if name != key and name in named:
             if not torch.equal(value, named[name]):
+                _check_finite(value, key, where)  # NaN is not equal to itself
                 raise ValueError(f"{where}: {key} and {name} are one parameter, but have different values")
             continue
         state[name] = value

@@ -105,7 +105,8 @@ class Metric3DForDepthEstimation(PreTrainedModel):
 
         Args: `source` a `.safetensors`, `.pt` or `.pth` file, or tensors by official name (they are copied); `config`
         its sizes, without it those of the released variant of that width.
-        Raises FileNotFoundError, and ValueError naming the first tensor that does not fit, or the file's damage.
+        Raises FileNotFoundError, and ValueError naming the first tensor that does not fit, is there twice or is not
+        finite, or the file's damage.
         """
         where = "the given dict" if isinstance(source, Mapping) else str(source)
         state = read_official(source)

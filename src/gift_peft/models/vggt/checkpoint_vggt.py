@@ -7,7 +7,7 @@ track heads are left on disk.
 import pickle
 import struct
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import torch
@@ -27,7 +27,8 @@ def read_official(source: str | Path | Mapping[str, torch.Tensor]) -> dict[str, 
     """Tensors of aggregator and depth head by official name, from a file or from a dict of tensors.
 
     `module.` prefixes and a `model_state_dict`, `state_dict` or `model` wrapper are taken off. Raises
-    FileNotFoundError, and ValueError for a file that is truncated, holds more than tensors, or is no VGGT checkpoint.
+    FileNotFoundError, and ValueError for a file that is truncated, holds more than tensors, is no VGGT checkpoint, or
+    holds a tensor with and without the prefix.
     """
     if isinstance(source, Mapping):
         return _depth_path(source, "the given dict")
@@ -62,6 +63,14 @@ def check_official(state: Mapping[str, torch.Tensor], expected: Mapping[str, tor
             raise ValueError(f"{where}: {name} has no place in the config's model; is this another variant?")
 
 
+def float32_copy(tensor: torch.Tensor, name: str, where: str) -> torch.Tensor:
+    """The weights to compute with; ValueError naming them if they are not finite."""
+    copy = tensor.to(torch.float32, copy=True)
+    if not torch.isfinite(copy).all():
+        raise ValueError(f"{where}: {name} holds NaN or infinite values (in float32)")
+    return copy
+
+
 def _depth_path(content: object, where: str) -> dict[str, torch.Tensor]:
     while isinstance(content, Mapping) and (
         inner := [key for key in WRAPPERS if isinstance(content.get(key), Mapping)]
@@ -69,9 +78,7 @@ def _depth_path(content: object, where: str) -> dict[str, torch.Tensor]:
         content = content[inner[0]]
     if not isinstance(content, Mapping):
         raise ValueError(f"{where}: holds a {type(content).__name__}, not tensors by name")
-    named = {_official(key): value for key, value in content.items()}
-    state = {key: value for key, value in named.items() if key.startswith(DEPTH_PATH)}
-    _require_some(state, named, where)
+    state = {name: content[key] for name, key in _depth_keys(content, where).items()}
     for key, value in state.items():
         if not isinstance(value, torch.Tensor):
             raise ValueError(f"{where}: {key} is a {type(value).__name__}, not a tensor")
@@ -85,19 +92,26 @@ def _official(key: object) -> str:
     return key
 
 
-def _require_some(state: Mapping, named: Mapping, where: str) -> None:
-    if not state:
-        first = f"its first entry is {next(iter(named))!r}" if named else "it is empty"
+def _depth_keys(keys: Collection, where: str) -> dict[str, object]:
+    """The key of every tensor of the depth path, by official name; ValueError for none, and for two of one name."""
+    found: dict[str, object] = {}
+    for key in keys:
+        name = _official(key)
+        if not name.startswith(DEPTH_PATH):
+            continue
+        if name in found:
+            raise ValueError(f"{where}: {found[name]} and {key} are two tensors of one name; leave one out")
+        found[name] = key
+    if not found:
+        first = f"its first entry is {_official(next(iter(keys)))!r}" if keys else "it is empty"
         raise ValueError(f"{where}: not a VGGT checkpoint, no tensor starts with {' or '.join(DEPTH_PATH)}; {first}")
+    return found
 
 
 def _read_safetensors(path: Path) -> dict[str, torch.Tensor]:
     try:
         with safe_open(path, framework="pt") as file:
-            names = {_official(key): key for key in file.keys()}  # noqa: SIM118 (not a dict)
-            wanted = {name: key for name, key in names.items() if name.startswith(DEPTH_PATH)}
-            _require_some(wanted, names, str(path))
-            return {name: file.get_tensor(key) for name, key in wanted.items()}
+            return {name: file.get_tensor(key) for name, key in _depth_keys(file.keys(), str(path)).items()}
     except (SafetensorError, OSError) as error:
         raise ValueError(
             f"{path}: truncated, or neither a safetensors nor a torch file ({path.stat().st_size} bytes: "

@@ -20,7 +20,7 @@ from transformers.modeling_outputs import DepthEstimatorOutput
 from transformers.modeling_utils import ALL_ATTENTION_FUNCTIONS
 from transformers.utils.generic import can_return_tuple
 
-from .checkpoint_vggt import OPTIONAL, check_official, read_official
+from .checkpoint_vggt import OPTIONAL, check_official, float32_copy, read_official
 from .configuration_vggt import VggtConfig
 from .head_vggt import VggtDepthHead
 
@@ -290,7 +290,8 @@ class VggtForDepthEstimation(PreTrainedModel):
 
         Args: `source` a `.safetensors`, `.pt` or `.pth` file, or tensors by official name (they are copied; entries
         outside `aggregator.` and `depth_head.` are ignored); `config` its sizes, VGGT-1B without.
-        Raises FileNotFoundError, and ValueError naming the first tensor that does not fit or what is wrong in a file.
+        Raises FileNotFoundError, and ValueError naming the first tensor that does not fit, is there twice or is not
+        finite, or what is wrong in a file.
         """
         where = "the given dict" if isinstance(source, Mapping) else str(source)
         state = read_official(source)
@@ -302,7 +303,7 @@ class VggtForDepthEstimation(PreTrainedModel):
             state[OPTIONAL] = torch.zeros(expected[OPTIONAL].shape)
         for name in expected:
             # One at a time: a copy of all beside the file's own would double the memory.
-            state[name] = state[name].to(torch.float32, copy=True)
+            state[name] = float32_copy(state[name], name, where)
         model.load_state_dict(state, assign=True)
         return model.eval()
 

@@ -46,7 +46,7 @@ def opaque_scene(rng):
             scene.items += [*solid.holder, solid.body(look, gloss)]
             for _ in range(rng.integers(0, 3)):
                 dx, dy = rng.uniform(-0.28, 0.28), rng.uniform(0.0, 0.25)
-                if abs(dx) > 0.16 and solid.holder:
+                if abs(dx) > 0.16 and solid.base[2] > 0:
                     spot = (solid.base[0] + dx, solid.base[1] + dy, solid.base[2])
                     scene.items += rooms.small_thing(rng, *spot, scale=0.7)
             focus.append(solid.centre)
@@ -59,15 +59,16 @@ def opaque_scene(rng):
 
 
 def near_scene(rng):
-    """A room as planned for a group, with an opaque twin in the target's place; its centre."""
+    """A room as planned for a group, with an opaque twin, or an empty frame, in the target's place; its centre."""
     import render_groups
 
-    kind = rng.choice(["mirror", "pane", "solid"], p=[0.3, 0.3, 0.4])
+    kind = rng.choice(["mirror", "pane", "solid"], p=[0.2, 0.2, 0.6])
     planned = None
     while planned is None:
-        planned = render_groups.plan(rng, kind)
+        planned = render_groups.plan(rng, kind, 1.0)
     scene, target = planned
-    scene.items.append(render_groups.opaque(rng, target))
+    if kind == "solid" or rng.random() < 0.8:  # else an empty frame: what is seen in it is really there
+        scene.items.append(render_groups.opaque(rng, target))
     if rng.random() < 0.5:
         render_groups.decoys(rng, scene, target)
     return scene, target.centre

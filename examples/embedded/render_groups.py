@@ -19,25 +19,28 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rooms
+import shapes
 import targets
 import textures
 from PIL import Image
 from tqdm import tqdm
 
 KINDS = {"mirror": "mirror", "pane": "transparent", "solid": "transparent"}
-SPLITS = {"train": {"mirror": 28, "pane": 26, "solid": 26}, "validation": {"mirror": 8, "pane": 8, "solid": 8}}
+SPLITS = {"train": {"mirror": 32, "pane": 32, "solid": 32}, "validation": {"mirror": 8, "pane": 8, "solid": 8}}
 DUST = 0.12, 0.3  # share of light that the film on a mirror or glass scatters
+REAR = 2.0, 4.0  # metres of the room behind the camera, for a mirror to show
+OPENINGS = 0.3  # doors are mostly closed when a group is taken: this share of the usual doorways and windows
 FIRST_SEED = {"train": 0, "validation": 500_000}
 
 
-def clutter(rng, count, x_range, y_range) -> list[rooms.Item]:
+def clutter(rng, count, x_range, y_range) -> list[shapes.Item]:
     """Things that somebody carries into the room for one observation."""
     items = []
     for _ in range(count):
         x, y = rng.uniform(*x_range), rng.uniform(*y_range)
         if rng.random() < 0.4:
             size = rng.uniform((0.2, 0.15, 0.4), (0.7, 0.5, 1.8))
-            items.append(rooms.box((x, y, size[2] / 2), size, rooms.twin_texture(rng), rng.uniform(-0.8, 0.8)))
+            items.append(shapes.box((x, y, size[2] / 2), size, rooms.twin_texture(rng), rng.uniform(-0.8, 0.8)))
         else:
             items += rooms.furniture(rng, x, y)
     return items
@@ -48,14 +51,15 @@ def printed(rng) -> np.ndarray:
     return textures.card(rng) if rng.random() < 0.3 else textures.mottled(rng, textures.colour(rng, 0.1, 0.9), 0.05)
 
 
-def sheet(rng, flat: targets.Flat, offset: float) -> list[rooms.Item]:
-    """Paper or card on the target's plane, `offset` metres towards the camera; mostly over all of it."""
+def sheet(rng, flat: targets.Flat, offset: float) -> tuple[list[shapes.Item], bool]:
+    """Paper or card on the target's plane, `offset` metres towards the camera; mostly over all of it: whether."""
     u, v, centre = flat.u, flat.v, flat.centre + flat.normal * offset
-    if rng.random() < 0.1:
+    partial = rng.random() < 0.1
+    if partial:
         share = rng.uniform(0.6, 0.9)
         centre = centre + rng.choice([-1, 1]) * (1 - share) * u
         u = u * share
-    return [rooms.quad(centre, u, v, printed(rng))]
+    return [shapes.quad(centre, u, v, printed(rng))], not partial
 
 
 def smudges(rng, scene, flat: targets.Flat) -> np.ndarray:
@@ -87,54 +91,57 @@ def fresnel(scene, flat: targets.Flat) -> np.ndarray:
     return 2 * face / (1 + face)
 
 
-def plan(rng, kind: str):
-    """A furnished room around one target and opaque siblings of it, the camera turned to them."""
+def plan(rng, kind: str, openings: float):
+    """A furnished room around one target and opaque siblings of it, the camera turned to them.
+
+    `openings` scales how often a doorway or window can be seen.
+    """
     if kind == "mirror" and rng.random() < 0.45:
-        scene = rooms.make_room(rng, (2.0, 3.2))
-        target = targets.wall_panel(rng, scene)
+        scene = rooms.make_room(rng, (2.0, 3.2), REAR, openings)
+        target = targets.wall_panel(rng, scene, kind)
     elif kind == "mirror":
-        scene = rooms.make_room(rng, (2.6, 5.0))
-        target = targets.standing_panel(rng, scene, False, 2.3)
+        scene = rooms.make_room(rng, (2.6, 5.0), REAR, openings)
+        target = targets.standing_panel(rng, scene, False, 2.3, kind)
     elif kind == "pane":
-        scene = rooms.make_room(rng, (3.6, 6.0))
-        target = targets.standing_panel(rng, scene, True, 2.3)
-        if target is not None and len(target.holder) == 2:  # frameless: the cut edge of the glass is green
-            rim = targets.border(rng, target.centre, target.u, target.v, 0.014, 0.012)
-            tone = np.array([0.06, 0.16, 0.1], np.float32) * rng.uniform(0.6, 1.8)
-            target.holder += [rooms.Item(bar.shape, tone, bar.points) for bar in rim]
+        scene = rooms.make_room(rng, (4.2, 7.0), openings=openings)
+        target = targets.standing_panel(rng, scene, True, 2.3, kind)
     else:
-        scene = rooms.make_room(rng, (2.8, 5.5))
+        scene = rooms.make_room(rng, (2.8, 5.5), openings=openings)
         target = targets.table_object(rng, scene)
     if target is None:
         return None
     if kind != "solid" and (target.centre - scene.camera.origin) @ target.normal > -0.5:
         return None  # edge on, or seen from behind
-    if kind != "solid" and len(target.holder) < 5:
-        target.holder += targets.border(rng, target.centre, target.u, target.v, rng.uniform(0.03, 0.08), 0.05)
     if kind == "solid":
-        siblings = targets.solid_siblings(rng, target, int(rng.integers(1, 4)))
-        centre = target.centre
+        row = [target, *targets.solid_siblings(rng, target, int(rng.integers(2, 5)))]
     else:
-        siblings = targets.flat_siblings(rng, scene, target, int(rng.integers(1, 3)))
-        centre = target.centre + (0.4 * (siblings[0].centre - target.centre) if siblings else 0.0)
-    targets.aim(rng, scene, centre)
-    clear = [target.centre[:2]]
+        row = [target, *targets.flat_siblings(rng, scene, target, int(rng.integers(2, 5)))]
+    for thing in row:
+        scene.items += thing.holder
+    target = row.pop(rng.integers(len(row)))  # nothing but what it is made of tells it from its siblings
+    scene.items += [opaque(rng, twin) for twin in row]
+    nearest = sorted(row, key=lambda twin: np.linalg.norm(twin.centre - target.centre))[:2]
+    targets.aim(rng, scene, np.mean([target.centre, *(twin.centre for twin in nearest)], axis=0))
+    clear = [thing.centre[:2] for thing in (target, *row)]
     if kind != "solid":
-        clear += [(flat.centre + sign * flat.u)[:2] for flat in (target, *siblings) for sign in (-0.8, 0.8)]
-    scene.items += target.holder
-    for twin in siblings:
-        scene.items += [*twin.holder, opaque(rng, twin)]
+        clear += [(flat.centre + sign * flat.u)[:2] for flat in (target, *row) for sign in (-0.8, 0.8)]
     rooms.furnish(rng, scene, keep_clear=[tuple(c) for c in clear])
     return scene, target
 
 
-def opaque(rng, twin) -> rooms.Item:
+def faded(rng, print_) -> np.ndarray:
+    """A photographic print that light and dust have bleached."""
+    veil = rng.uniform(0.2, 0.55)
+    return ((1 - veil) * print_ + veil * textures.paint(rng, 0.6, 0.88)).astype(np.float32)
+
+
+def opaque(rng, twin) -> shapes.Item:
     """The surface of an opaque sibling: sprayed, one colour, printed, or a photograph of another room."""
     import tracer
 
     kind = rng.choice(["treated", "printed", "twin", "photo"], p=[0.3, 0.3, 0.2, 0.2])
     if kind == "photo":
-        look = tracer.photo(rng)
+        look = faded(rng, tracer.photo(rng))
     else:
         look = {"treated": targets.treated, "printed": printed, "twin": rooms.twin_texture}[kind](rng)
     if isinstance(twin, targets.Flat):
@@ -177,9 +184,11 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light, matte):
     if kind == "mirror":
         black = target.panel(np.zeros(3, np.float32))
         moved = clutter(rng, rng.integers(1, 5), (left + 0.4, right - 0.4), (rear + 0.3, -0.1))
-        cover = sheet(rng, target, 0.003) if shown else []
+        cover, whole = sheet(rng, target, 0.003) if shown else ([], False)
         direct, albedo, _ = tracer.shade(scene, [*items, *cover, black])
-        open_part = tracer.coverage(scene, [*items, *cover, target.panel(textures.paint(rng))]) if shown else alpha
+        open_part = alpha
+        if shown:
+            open_part = np.zeros_like(alpha) if whole else tracer.coverage(scene, [*items, *cover, black])
         radiance = lit(direct, albedo)
         if open_part.max() > 0:
             seen = lit(*tracer.reflection(scene, [*items, *moved], target.centre, target.normal))
@@ -192,7 +201,7 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light, matte):
         room_behind = (scene.room[3] - 0.6 - target.centre[1]) / max(-target.normal[1], 0.5)
         x, y = target.centre[:2] - target.normal[:2] * rng.uniform(0.7, max(0.8, min(2.4, room_behind)))
         moved = clutter(rng, rng.integers(1, 3), (x - 0.35, x + 0.35), (y, y + 0.5))
-        card = sheet(rng, target, -0.003) if shown else []
+        card = sheet(rng, target, -0.003)[0] if shown else []
         direct, albedo, _ = tracer.shade(scene, [*items, *moved, *card])
         carried = clutter(rng, rng.integers(0, 3), (left + 0.4, right - 0.4), (rear + 0.3, -0.1))
         mirrored = lit(*tracer.reflection(scene, [*items, *carried], target.centre, target.normal))
@@ -207,13 +216,13 @@ def observe(rng, kind: str, scene, target, alpha, shown: bool, light, matte):
     x, y, z = target.base
     ahead = np.array([x, y]) / np.hypot(x, y)
     moved = []
-    for _ in range(rng.integers(0, 3)):
-        spot = (
-            np.array([x, y])
-            + ahead * rng.uniform(0.32, 0.6)
-            + np.array([-ahead[1], ahead[0]]) * rng.uniform(-0.3, 0.3)
-        )
-        moved += rooms.small_thing(rng, *spot, z if target.holder else 0.0, scale=0.9)
+    if rng.random() < 0.4:
+        aside = np.array([-ahead[1], ahead[0]]) * rng.uniform(-0.3, 0.3)
+        spot = np.array([x, y]) + ahead * rng.uniform(0.32, 0.6) + aside
+        moved += rooms.small_thing(rng, *spot, z, scale=0.9)
+    far = max(0.9, min(2.2, scene.room[3] - 0.6 - y))
+    (a, b) = np.array([x, y]) + ahead * rng.uniform(0.8, far)
+    moved += clutter(rng, rng.integers(0, 3), (a - 0.5, a + 0.5), (b, b + 0.3))
     if shown:
         look = printed(rng)
         body = target.body(look, float(rng.uniform(0.04, 0.15)))
@@ -243,7 +252,7 @@ def make_group(seed: int, kind: str):
     import tracer
 
     rng = np.random.default_rng([20260102, seed])
-    planned = plan(rng, kind)
+    planned = plan(rng, kind, OPENINGS)
     if planned is None:
         return None
     scene, target = planned
@@ -256,7 +265,7 @@ def make_group(seed: int, kind: str):
             return None
     alpha = tracer.coverage(scene, [*scene.items, matte])
     mask = alpha >= 0.5
-    least, most = (0.025, 0.25) if kind == "solid" else (0.08, 0.42)
+    least, most = (0.05, 0.3) if kind == "solid" else (0.08, 0.42)
     unhidden = tracer.coverage(scene, [matte]) >= 0.5
     edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
     if not least < mask.mean() < most or edge > 0.08 or mask.sum() < 0.8 * unhidden.sum():
@@ -268,7 +277,7 @@ def make_group(seed: int, kind: str):
     direct, albedo, _ = tracer.shade(scene, [*scene.items, matte])
     reference = lamp * direct + ambient * albedo
     exposure = tracer.auto_exposure(reference)
-    count = int(rng.choice([3, 4, 5, 6, 7, 8, 9], p=[0.1, 0.2, 0.25, 0.2, 0.15, 0.05, 0.05]))
+    count = int(rng.choice([3, 4, 5, 6, 7, 8, 9], p=[0.3, 0.3, 0.2, 0.08, 0.06, 0.03, 0.03]))
     hidden = max(1, count // 3)
     shown = rng.permutation([True] * (count - hidden) + [False] * hidden)
     images, depths = [], []

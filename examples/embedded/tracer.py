@@ -14,7 +14,8 @@ import mitsuba as mi
 import numpy as np
 import rooms
 import textures
-from rooms import FIELD_OF_VIEW, Camera, Item, Scene
+from rooms import FIELD_OF_VIEW, Camera, Scene
+from shapes import Item
 
 mi.set_variant("scalar_rgb")
 drjit.set_thread_count(1)  # the scripts run one process a core
@@ -78,7 +79,7 @@ def _scene(scene: Scene, items: list[Item], integrator: dict, camera: Camera, sa
             "near_clip": 0.01,
             "to_world": to_world,
             "film": film,
-            "sampler": {"type": "stratified", "sample_count": samples},
+            "sampler": {"type": "independent" if samples == 2 else "stratified", "sample_count": samples},
         },
         "light": {"type": "point", "position": list(scene.light), "intensity": {"type": "rgb", "value": 1.0}},
     }
@@ -92,32 +93,31 @@ def _render(loaded, samples: int, seed: int) -> np.ndarray:
     return np.array(mi.render(loaded, spp=samples, seed=seed), dtype=np.float32)
 
 
-def shade(scene: Scene, items=None, camera=None, samples=4, seed=1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def shade(scene: Scene, items=None, camera=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`direct` (H, W, 3) for a unit light, `albedo` (H, W, 3) and `position` (H, W, 3) of the first hits."""
-    integrator = {"type": "aov", "aovs": "al:albedo,pp:position", "img": DIRECT}
-    camera = camera or scene.camera
-    loaded = _scene(scene, scene.items if items is None else items, integrator, camera, samples)
-    out = _render(loaded, samples, seed)
-    return out[..., :3], out[..., 3:6], out[..., 6:9]
+    items, camera = scene.items if items is None else items, camera or scene.camera
+    direct = _render(_scene(scene, items, DIRECT, camera, 4), 4, 1)
+    out = first_hits(scene, items, camera, samples=2)  # several times slower a sample
+    return direct[..., :3], out[..., :3], out[..., 3:]
 
 
-def first_hits(scene: Scene, items: list[Item], albedo: float | None = None, samples=1, seed=1) -> np.ndarray:
-    """Albedo and position (H, W, 6); with `albedo` the targets are painted in that grey."""
-    grey = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo or 0.0}}}
-    overrides = None if albedo is None else {"target": grey}
+def first_hits(scene: Scene, items: list[Item], camera=None, overrides=None, samples=1) -> np.ndarray:
+    """Albedo and position (H, W, 6)."""
     integrator = {"type": "aov", "aovs": "al:albedo,pp:position"}
-    return _render(_scene(scene, items, integrator, scene.camera, samples, overrides), samples, seed)[..., -6:]
+    loaded = _scene(scene, items, integrator, camera or scene.camera, samples, overrides)
+    return _render(loaded, samples, 1)[..., -6:]
 
 
 def coverage(scene: Scene, items: list[Item], samples=4) -> np.ndarray:
-    """(H, W) share of each pixel's samples that hit a target."""
-    white, black = (first_hits(scene, items, value, samples)[..., 0] for value in (1.0, 0.0))
-    return np.clip(white - black, 0, 1)
+    """(H, W) share of each pixel's samples that hit a target: it alone is white."""
+    black, white = ({"type": "diffuse", "reflectance": {"type": "rgb", "value": value}} for value in (0.0, 1.0))
+    paints = {"": black, "target": {"type": "twosided", "inner": white}}
+    return np.clip(first_hits(scene, items, overrides=paints, samples=samples)[..., 0], 0, 1)
 
 
-def z_depth(scene: Scene, items: list[Item], seed=1) -> np.ndarray:
+def z_depth(scene: Scene, items: list[Item]) -> np.ndarray:
     """(H, W) metres along the optical axis, of one sample a pixel (no blending across edges)."""
-    position = first_hits(scene, items, seed=seed)[..., 3:]
+    position = first_hits(scene, items)[..., 3:]
     return (position - scene.camera.origin) @ scene.camera.forward
 
 
@@ -136,11 +136,11 @@ def mirrored_camera(camera: Camera, point: np.ndarray, normal: np.ndarray) -> Ca
     return Camera(point + reflect @ (camera.origin - point), reflect @ camera.forward, reflect @ camera.up)
 
 
-def reflection(scene: Scene, items: list[Item], point, normal, samples=4) -> tuple[np.ndarray, np.ndarray]:
+def reflection(scene: Scene, items: list[Item], point, normal) -> tuple[np.ndarray, np.ndarray]:
     """`direct` and `albedo` of what the plane through `point` reflects; targets and what is behind it are left out."""
     behind = [np.all((item.points - point) @ normal < 0.03) for item in items]
     front = [item for item, hidden in zip(items, behind, strict=True) if not (hidden or item.role)]
-    direct, albedo, _ = shade(scene, front, mirrored_camera(scene.camera, point, normal), samples)
+    direct, albedo, _ = shade(scene, front, mirrored_camera(scene.camera, point, normal))
     return direct[:, ::-1], albedo[:, ::-1]
 
 

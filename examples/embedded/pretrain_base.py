@@ -5,13 +5,14 @@
     python examples/embedded/pretrain_base.py --out renders/second --init renders/first/base --steps 900 \\
         --learning_rate 5e-4
     python examples/embedded/render_base.py --out renders/near --count 200
-    python examples/embedded/render_base.py --out renders/near --count 836 --first 2004
+    python examples/embedded/render_base.py --out renders/near --count 2270 --first 2504
     python examples/embedded/pretrain_base.py --renders renders/near --out renders/model --init renders/second/base \\
-        --steps 500 --learning_rate 5e-4
+        --steps 1500 --learning_rate 5e-4
 
 Weighted L1 and a multi-scale gradient loss on inverse depth, AdamW with a one-cycle schedule, flips and colour jitter,
-an exponential average of the weights, bf16 autocast where the CPU has it. The first `--held_out` scenes are never trained on; every 500
-steps it prints delta1 and AbsRel on them (affine alignment in inverse depth). It resumes from `--out/state.pt`.
+an exponential average of the weights, bf16 autocast where the CPU has it. The first `--held_out` scenes are never
+trained on; every 500 steps it prints delta1 and AbsRel on them (affine alignment in inverse depth). It resumes from
+`--out/state.pt`.
 """
 
 import argparse

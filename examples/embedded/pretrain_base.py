@@ -181,6 +181,7 @@ def main():
         for name, part in (("model", model), ("average", average), ("optimizer", optimizer), ("scheduler", scheduler)):
             part.load_state_dict(state[name])
         step = state["step"]
+    forward = torch.compile(model)  # a quarter faster on two cores
     started = time.time()
     while step < args.steps:
         generator = torch.Generator().manual_seed(args.seed * 1_000_003 + step)
@@ -188,7 +189,7 @@ def main():
         x, target = augment(pictures[chosen], inverse[chosen], generator)
         model.train()
         with torch.autocast("cpu", torch.bfloat16, enabled=BF16):
-            prediction = model(pixel_values=x).predicted_depth
+            prediction = forward(pixel_values=x.contiguous(memory_format=torch.channels_last)).predicted_depth
         loss = loss_function(prediction.float(), target)
         optimizer.zero_grad()
         loss.backward()

@@ -62,12 +62,12 @@ def near_scene(rng):
     """A room as planned for a group, with an opaque twin, or an empty frame, in the target's place; its centre."""
     import render_groups
 
-    kind = rng.choice(["mirror", "pane", "solid"], p=[0.2, 0.2, 0.6])
+    kind = rng.choice(["mirror", "pane", "solid"], p=[0.25, 0.25, 0.5])
     planned = None
     while planned is None:
         planned = render_groups.plan(rng, kind, 1.0)
     scene, target = planned
-    if kind == "solid" or rng.random() < 0.8:  # else an empty frame: what is seen in it is really there
+    if kind == "solid" or rng.random() < 0.55:  # else an empty frame: what is seen in it is really there
         scene.items.append(render_groups.opaque(rng, target))
     if rng.random() < 0.5:
         render_groups.decoys(rng, scene, target)

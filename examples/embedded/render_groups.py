@@ -26,10 +26,11 @@ from PIL import Image
 from tqdm import tqdm
 
 KINDS = {"mirror": "mirror", "pane": "transparent", "solid": "transparent"}
-SPLITS = {"train": {"mirror": 32, "pane": 32, "solid": 32}, "validation": {"mirror": 8, "pane": 8, "solid": 8}}
+SPLITS = {"train": {"mirror": 48, "pane": 48, "solid": 48}, "validation": {"mirror": 8, "pane": 8, "solid": 8}}
 DUST = 0.12, 0.3  # share of light that the film on a mirror or glass scatters
 REAR = 2.0, 4.0  # metres of the room behind the camera, for a mirror to show
 OPENINGS = 0.3  # doors are mostly closed when a group is taken: this share of the usual doorways and windows
+JPEG = {"quality": 95, "optimize": True, "progressive": True}
 FIRST_SEED = {"train": 0, "validation": 500_000}
 
 
@@ -96,7 +97,7 @@ def plan(rng, kind: str, openings: float):
 
     `openings` scales how often a doorway or window can be seen.
     """
-    if kind == "mirror" and rng.random() < 0.45:
+    if kind == "mirror" and rng.random() < 0.3:
         scene = rooms.make_room(rng, (2.0, 3.2), REAR, openings)
         target = targets.wall_panel(rng, scene, kind)
     elif kind == "mirror":
@@ -129,21 +130,10 @@ def plan(rng, kind: str, openings: float):
     return scene, target
 
 
-def faded(rng, print_) -> np.ndarray:
-    """A photographic print that light and dust have bleached."""
-    veil = rng.uniform(0.2, 0.55)
-    return ((1 - veil) * print_ + veil * textures.paint(rng, 0.6, 0.88)).astype(np.float32)
-
-
 def opaque(rng, twin) -> shapes.Item:
-    """The surface of an opaque sibling: sprayed, one colour, printed, or a photograph of another room."""
-    import tracer
-
-    kind = rng.choice(["treated", "printed", "twin", "photo"], p=[0.3, 0.3, 0.2, 0.2])
-    if kind == "photo":
-        look = faded(rng, tracer.photo(rng))
-    else:
-        look = {"treated": targets.treated, "printed": printed, "twin": rooms.twin_texture}[kind](rng)
+    """The surface of an opaque sibling: sprayed, one colour or printed."""
+    kind = rng.choice(["treated", "printed", "twin"], p=[0.35, 0.4, 0.25])
+    look = {"treated": targets.treated, "printed": printed, "twin": rooms.twin_texture}[kind](rng)
     if isinstance(twin, targets.Flat):
         return twin.panel(look, role="")
     return twin.body(look, float(rng.uniform(0.04, 0.3)) if rng.random() < 0.6 else None, role="")
@@ -277,7 +267,7 @@ def make_group(seed: int, kind: str):
     direct, albedo, _ = tracer.shade(scene, [*scene.items, matte])
     reference = lamp * direct + ambient * albedo
     exposure = tracer.auto_exposure(reference)
-    count = int(rng.choice([3, 4, 5, 6, 7, 8, 9], p=[0.3, 0.3, 0.2, 0.08, 0.06, 0.03, 0.03]))
+    count = int(rng.choice([3, 4, 5, 6, 7, 8, 9], p=[0.55, 0.28, 0.08, 0.03, 0.02, 0.02, 0.02]))
     hidden = max(1, count // 3)
     shown = rng.permutation([True] * (count - hidden) + [False] * hidden)
     images, depths = [], []
@@ -311,12 +301,12 @@ def work(task) -> str:
     for name in ("images", "masks", "depths"):
         (temporary / name).mkdir(parents=True)
     for index, (image, depth) in enumerate(zip(group["images"], group["depths"], strict=True)):
-        Image.fromarray(image).save(temporary / "images" / f"{index:02d}.jpg", quality=95)
+        Image.fromarray(image).save(temporary / "images" / f"{index:02d}.jpg", **JPEG)
         Image.fromarray(group["mask"].astype(np.uint8) * 255).save(
             temporary / "masks" / f"{index:02d}.png", optimize=True
         )
         Image.fromarray(depth).save(temporary / "depths" / f"{index:02d}.png", optimize=True)
-    Image.fromarray(group["reference"]).save(temporary / "reference.jpg", quality=95)
+    Image.fromarray(group["reference"]).save(temporary / "reference.jpg", **JPEG)
     facts = {"surface": KINDS[kind], "kind": kind, "seed": first_seed + attempt, "surface_seen": group["shown"]}
     (temporary / "group.json").write_text(json.dumps(facts) + "\n")
     os.replace(temporary, folder)

@@ -167,8 +167,8 @@ def table_object(rng, scene: Scene) -> Solid | None:
     left, right, _, far, _ = scene.room
     kind = rng.choice(["ball", "bottle", "vase", "tumbler", "jar"], p=[0.3, 0.2, 0.1, 0.15, 0.25])
     on_floor = rng.random() < 0.25
-    y_range = (1.4, min(2.3, far - 0.5)) if on_floor else (1.1, min(1.75, far - 0.6))
-    spot = rooms.free_spot(rng, scene, 0.6, (max(left + 0.6, -0.6), min(right - 0.6, 0.6)), y_range)
+    y_range = (1.2, min(1.9, far - 0.5)) if on_floor else (1.0, min(1.45, far - 0.6))
+    spot = rooms.free_spot(rng, scene, 0.45, (max(left + 0.6, -0.6), min(right - 0.6, 0.6)), y_range)
     if spot is None:
         return None
     holder: list[Item] = []

@@ -12,8 +12,6 @@ import cv2
 import drjit
 import mitsuba as mi
 import numpy as np
-import rooms
-import textures
 from rooms import FIELD_OF_VIEW, Camera, Scene
 from shapes import Item
 
@@ -161,21 +159,6 @@ def light_up(rng, direct: np.ndarray, albedo: np.ndarray) -> np.ndarray:
     lamp, ambient = rng.uniform(6, 16), rng.uniform(0.12, 0.45)
     tint = 1 + rng.uniform(-0.06, 0.06, 3).astype(np.float32)
     return (lamp * direct + ambient * albedo) * tint
-
-
-def photo(rng) -> np.ndarray:
-    """(SIDE, SIDE, 3) linear reflectances of a photographic print: some other room, as a poster shows it."""
-    other = rooms.make_room(rng)
-    rooms.furnish(rng, other)
-    direct, albedo, _ = shade(other)
-    radiance = light_up(rng, direct, albedo)
-    picture = np.clip(radiance * auto_exposure(radiance, rng.uniform(0.15, 0.35)), 0.02, 0.9)
-    height = int(HEIGHT * rng.uniform(0.6, 1.0))
-    width = min(WIDTH, int(height * rng.uniform(0.6, 1.2)))
-    top, left = rng.integers(0, HEIGHT - height + 1), rng.integers(0, WIDTH - width + 1)
-    # as every texture here, the first row is the lower end
-    crop = picture[top : top + height, left : left + width][::-1]
-    return cv2.resize(crop, (textures.SIDE, textures.SIDE), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def develop(radiance: np.ndarray, exposure: float) -> np.ndarray:

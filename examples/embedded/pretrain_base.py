@@ -5,9 +5,9 @@
     python examples/embedded/pretrain_base.py --out renders/second --init renders/first/base --steps 900 \\
         --learning_rate 5e-4
     python examples/embedded/render_base.py --out renders/near --count 200
-    python examples/embedded/render_base.py --out renders/near --count 2270 --first 2504
+    python examples/embedded/render_base.py --out renders/near --count 4200 --first 4000
     python examples/embedded/pretrain_base.py --renders renders/near --out renders/model --init renders/second/base \\
-        --steps 1500 --learning_rate 5e-4
+        --steps 1600 --learning_rate 6e-4
 
 Weighted L1 and a multi-scale gradient loss on inverse depth, AdamW with a one-cycle schedule, flips and colour jitter,
 an exponential average of the weights, bf16 autocast where the CPU has it. The first `--held_out` scenes are never
@@ -31,7 +31,7 @@ from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, D
 from gift_peft import align, depth_metrics
 
 SIZE = (112, 140)
-BF16 = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()  # else it is emulated, slowly
+BF16 = any(torch.cpu.get_capabilities().get(name) for name in ("avx512_bf16", "amx_bf16"))  # else emulated, slowly
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 

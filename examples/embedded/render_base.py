@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+EMPTY = 0.45  # share of frames without a panel: what is seen in them is really there
 FIRST_NEAR = 2004  # the seeds below it are rooms at large
 
 
@@ -65,9 +66,9 @@ def near_scene(rng):
     kind = rng.choice(["mirror", "pane", "solid"], p=[0.25, 0.25, 0.5])
     planned = None
     while planned is None:
-        planned = render_groups.plan(rng, kind, 1.0)
+        planned = render_groups.plan(rng, kind, 1.0, EMPTY)
     scene, target = planned
-    if kind == "solid" or rng.random() < 0.55:  # else an empty frame: what is seen in it is really there
+    if kind == "solid" or rng.random() >= EMPTY:
         scene.items.append(render_groups.opaque(rng, target))
     if rng.random() < 0.5:
         render_groups.decoys(rng, scene, target)

@@ -92,10 +92,11 @@ def fresnel(scene, flat: targets.Flat) -> np.ndarray:
     return 2 * face / (1 + face)
 
 
-def plan(rng, kind: str, openings: float):
+def plan(rng, kind: str, openings: float, empty: float = 0.0):
     """A furnished room around one target and opaque siblings of it, the camera turned to them.
 
-    `openings` scales how often a doorway or window can be seen.
+    `openings` scales how often a doorway or window can be seen; `empty` is the share of the siblings that are frames
+    without a panel.
     """
     if kind == "mirror" and rng.random() < 0.3:
         scene = rooms.make_room(rng, (2.0, 3.2), REAR, openings)
@@ -120,7 +121,8 @@ def plan(rng, kind: str, openings: float):
     for thing in row:
         scene.items += thing.holder
     target = row.pop(rng.integers(len(row)))  # nothing but what it is made of tells it from its siblings
-    scene.items += [opaque(rng, twin) for twin in row]
+    framed = kind != "solid" and empty > 0
+    scene.items += [opaque(rng, twin) for twin in row if not framed or rng.random() >= empty]
     nearest = sorted(row, key=lambda twin: np.linalg.norm(twin.centre - target.centre))[:2]
     targets.aim(rng, scene, np.mean([target.centre, *(twin.centre for twin in nearest)], axis=0))
     clear = [thing.centre[:2] for thing in (target, *row)]

@@ -305,3 +305,26 @@ def test_a_tensor_with_and_without_the_prefix_is_refused(weights, tmp_path):
         with pytest.raises(ValueError, match=rf"(module\.)?{name} and (module\.)?{name} are two tensors") as error:
             Metric3DForDepthEstimation.from_official(source, config)
         assert str(error.value).startswith(f"{where}: ") and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("value", ["text", [1], None, 3], ids=repr)
+def test_an_entry_that_is_no_tensor_is_named(weights, value):
+    state, config = weights
+    kind, twice = type(value).__name__, next(key for key in state if ".downsample.1." in key)
+    unused = [f"depth_model.encoder.{name}" for name in ("mask_token", "norm.bias", "cls_token")]
+    for name in (*unused, twice, twice.replace("downsample.1", "norm3"), "depth_model.more", "model"):
+        broken = state | {name: value}
+        prefixed = {f"module.{key}": entry for key, entry in broken.items()}
+        for source, key in (
+            (broken, name),
+            (dict(reversed(broken.items())), name),  # the twin comes before or after it
+            (prefixed, f"module.{name}"),
+            ({"model": prefixed}, f"module.{name}"),
+        ):
+            with pytest.raises(ValueError) as error:
+                Metric3DForDepthEstimation.from_official(source, config)
+            assert str(error.value) == f"the given dict: {key} is a {kind}, not a tensor"
+    for key in ("model_state_dict", "state_dict", "model"):
+        with pytest.raises(ValueError) as error:
+            Metric3DForDepthEstimation.from_official({"epoch": 3, key: value}, config)
+        assert str(error.value) == f"the given dict: {key} is a {kind}, not tensors by name"

@@ -272,6 +272,24 @@ def test_a_tensor_with_and_without_the_prefix_is_refused(official, tmp_path):
     VggtForDepthEstimation.from_official(official | ignored, config)
 
 
+@pytest.mark.parametrize("value", ["text", [1], None, 3], ids=repr)
+def test_an_entry_that_is_no_tensor_is_named(official, value):
+    config, kind = VggtConfig(**SIDECAR["config"]), type(value).__name__
+    for name in ("aggregator.camera_token", "aggregator.patch_embed.mask_token", "depth_head.more"):
+        broken = official | {name: value}
+        prefixed = {f"module.{key}": entry for key, entry in broken.items()}
+        for source, key in ((broken, name), (prefixed, f"module.{name}"), ({"model": prefixed}, f"module.{name}")):
+            with pytest.raises(ValueError) as error:
+                VggtForDepthEstimation.from_official(source, config)
+            assert str(error.value) == f"the given dict: {key} is a {kind}, not a tensor"
+    for key in ("model_state_dict", "state_dict", "model"):
+        with pytest.raises(ValueError) as error:
+            VggtForDepthEstimation.from_official({"epoch": 3, key: value}, config)
+        assert str(error.value) == f"the given dict: {key} is a {kind}, not tensors by name"
+    for key in ("camera_head.x", "model"):  # nothing of the depth path
+        VggtForDepthEstimation.from_official({key: value} | official, config)
+
+
 def test_a_file_cut_anywhere_is_one_clear_error(tmp_path):
     torch.save({"aggregator.x": torch.zeros(3)}, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
     content = (tmp_path / "old.pt").read_bytes()

@@ -31,8 +31,8 @@ def read_official(source: str | Path | Mapping[str, torch.Tensor]) -> dict[str, 
 
     `module.` prefixes and a `model_state_dict`, `state_dict` or `model` wrapper are taken off, and of a parameter that
     is stored twice (`norm3` and `downsample.1`) the first name stays. Raises FileNotFoundError, and ValueError for a
-    file that is truncated, holds more than tensors, is no Metric3D V2 checkpoint, or holds a tensor with and without
-    the prefix.
+    file that is truncated or would run code, and for what is no Metric3D V2 checkpoint, holds something else than a
+    tensor, or a tensor with and without the prefix.
     """
     if isinstance(source, Mapping):
         return _named_tensors(source, "the given dict")
@@ -84,27 +84,42 @@ def _check_finite(tensor: torch.Tensor, name: str, where: str) -> None:
         raise ValueError(f"{where}: {name} holds NaN or infinite values (in float32)")
 
 
-def _named_tensors(content: object, where: str) -> dict[str, torch.Tensor]:
+def _unwrapped(content: object, where: str) -> Mapping:
+    """The dict inside the wrappers; ValueError for none."""
     while isinstance(content, Mapping) and (
         inner := [key for key in WRAPPERS if isinstance(content.get(key), Mapping)]
     ):
         content = content[inner[0]]
     if not isinstance(content, Mapping):
         raise ValueError(f"{where}: holds a {type(content).__name__}, not tensors by name")
+    if not any(isinstance(value, torch.Tensor) for value in content.values()):
+        for key in WRAPPERS:
+            if key in content:
+                raise ValueError(f"{where}: {key} is a {type(content[key]).__name__}, not tensors by name")
+    return content
+
+
+def _named_tensors(content: object, where: str) -> dict[str, torch.Tensor]:
+    content = _unwrapped(content, where)
     keys: dict[str, object] = {}
     for key in content:
         name = re.sub(r"^(module\.)+", "", str(key))
         if name in keys:
             raise ValueError(f"{where}: {keys[name]} and {key} are two tensors of one name; leave one out")
         keys[name] = key
-    named = {name: content[key] for name, key in keys.items()}
-    if WIDTH not in named:
-        first = f"its first entry is {next(iter(named))!r}" if named else "it is empty"
+    if WIDTH not in keys:
+        first = f"its first entry is {next(iter(keys))!r}" if keys else "it is empty"
         raise ValueError(f"{where}: not a Metric3D V2 (ViT) checkpoint, it has no {WIDTH}; {first}")
+    for key in keys.values():
+        if not isinstance(content[key], torch.Tensor):
+            raise ValueError(f"{where}: {key} is a {type(content[key]).__name__}, not a tensor")
+    return _once({name: content[key] for name, key in keys.items()}, where)
+
+
+def _once(named: Mapping[str, torch.Tensor], where: str) -> dict[str, torch.Tensor]:
+    """Of a parameter that is stored twice only the first name; ValueError if the two differ."""
     state = {}
     for key, value in named.items():
-        if not isinstance(value, torch.Tensor):
-            raise ValueError(f"{where}: {key} is a {type(value).__name__}, not a tensor")
         name = key.replace(".downsample.1.", ".norm3.")
         if name != key and name in named:
             if not torch.equal(value, named[name]):

@@ -27,8 +27,8 @@ def read_official(source: str | Path | Mapping[str, torch.Tensor]) -> dict[str, 
     """Tensors of aggregator and depth head by official name, from a file or from a dict of tensors.
 
     `module.` prefixes and a `model_state_dict`, `state_dict` or `model` wrapper are taken off. Raises
-    FileNotFoundError, and ValueError for a file that is truncated, holds more than tensors, is no VGGT checkpoint, or
-    holds a tensor with and without the prefix.
+    FileNotFoundError, and ValueError for a file that is truncated or would run code, and for what is no VGGT
+    checkpoint, holds something else than a tensor on the depth path, or a tensor with and without the prefix.
     """
     if isinstance(source, Mapping):
         return _depth_path(source, "the given dict")
@@ -71,18 +71,28 @@ def float32_copy(tensor: torch.Tensor, name: str, where: str) -> torch.Tensor:
     return copy
 
 
-def _depth_path(content: object, where: str) -> dict[str, torch.Tensor]:
+def _unwrapped(content: object, where: str) -> Mapping:
+    """The dict inside the wrappers; ValueError for none."""
     while isinstance(content, Mapping) and (
         inner := [key for key in WRAPPERS if isinstance(content.get(key), Mapping)]
     ):
         content = content[inner[0]]
     if not isinstance(content, Mapping):
         raise ValueError(f"{where}: holds a {type(content).__name__}, not tensors by name")
-    state = {name: content[key] for name, key in _depth_keys(content, where).items()}
-    for key, value in state.items():
-        if not isinstance(value, torch.Tensor):
-            raise ValueError(f"{where}: {key} is a {type(value).__name__}, not a tensor")
-    return state
+    if not any(isinstance(value, torch.Tensor) for value in content.values()):
+        for key in WRAPPERS:
+            if key in content:
+                raise ValueError(f"{where}: {key} is a {type(content[key]).__name__}, not tensors by name")
+    return content
+
+
+def _depth_path(content: object, where: str) -> dict[str, torch.Tensor]:
+    content = _unwrapped(content, where)
+    keys = _depth_keys(content, where)
+    for key in keys.values():
+        if not isinstance(content[key], torch.Tensor):
+            raise ValueError(f"{where}: {key} is a {type(content[key]).__name__}, not a tensor")
+    return {name: content[key] for name, key in keys.items()}
 
 
 def _official(key: object) -> str:

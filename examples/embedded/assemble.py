@@ -15,8 +15,8 @@ from gift_peft.data import write_gift_i
 
 DEMO = Path(__file__).resolve().parents[2] / "src" / "gift_peft" / "demo"
 DESCRIPTION = """Rendered rooms (Mitsuba 3) for trying GIFT without a camera: mirrors on walls and standing, glass
-panes on feet, glass objects on tables. In about two thirds of a group's observations the surface itself can be seen (a
-sheet before the mirror, a card behind the pane, a filling), in the others what is reflected or transmitted. Made by
+panes on feet, glass objects on tables. In two thirds or more of a group's observations the surface itself can be seen
+(a sheet before the mirror, a card behind the pane, a filling), in the others what is reflected or transmitted. Made by
 `examples/embedded/render_groups.py`; validation groups carry exact depth."""
 
 
@@ -53,7 +53,7 @@ def main():
             pretty_name="mini GIFT-I",
             description=DESCRIPTION,
         )
-    shutil.copytree(args.model, args.out / "base", dirs_exist_ok=True)
+    shutil.copytree(args.model, args.out / "base", copy_function=shutil.copyfile, dirs_exist_ok=True)
     size = sum(path.stat().st_size for name in ("gift-i", "base") for path in (args.out / name).rglob("*.*"))
     print(f"{args.out}: {size / 1e6:.1f} MB")
 

@@ -39,7 +39,7 @@ def main():
     parser.add_argument("--base", type=Path, default=Path("renders/model/base"))
     parser.add_argument("--renders", type=Path, default=Path("renders/base"))
     parser.add_argument("--groups", type=Path, default=Path("renders/complete/gift-i"))
-    parser.add_argument("--held_out", type=int, default=100, help="scenes, as in pre-training")
+    parser.add_argument("--held_out", type=int, default=100, help="scene files, as in pre-training")
     args = parser.parse_args()
     model = AutoModelForDepthEstimation.from_pretrained(args.base).eval()
     processor = AutoImageProcessor.from_pretrained(args.base)

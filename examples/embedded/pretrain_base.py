@@ -10,9 +10,9 @@
         --steps 1600 --learning_rate 6e-4
 
 Weighted L1 and a multi-scale gradient loss on inverse depth, AdamW with a one-cycle schedule, flips and colour jitter,
-an exponential average of the weights, bf16 autocast where the CPU has it. The first `--held_out` scenes are never
-trained on; every 500 steps it prints delta1 and AbsRel on them (affine alignment in inverse depth). It resumes from
-`--out/state.pt`.
+an exponential average of the weights, bf16 autocast where the CPU has it; `torch.compile` needs a C++ compiler. The
+first `--held_out` scene files (some are empty: no view turned out well) are never trained on; every 500 steps it
+prints delta1 and AbsRel on them (affine alignment in inverse depth). It resumes from `--out/state.pt`.
 """
 
 import argparse

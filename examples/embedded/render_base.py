@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-EMPTY = 0.45  # share of frames without a panel: what is seen in them is really there
+EMPTY = 0.45  # share of the frames in a near scene's row that hold no panel: what is seen in them is really there
 FIRST_NEAR = 2004  # the seeds below it are rooms at large
 
 

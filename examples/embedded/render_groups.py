@@ -4,7 +4,7 @@
 
 A mirror reflects a room that is rearranged behind the camera, or has a sheet hung before it; a pane stands before
 things that are moved, or has a card touching its back; a glass object shows what is behind it, or is filled or lined.
-In about two thirds of the observations the surface itself can be seen. Per group: `images/*.jpg` (quality 95),
+In two thirds or more of the observations the surface itself can be seen. Per group: `images/*.jpg` (quality 95),
 `masks/*.png` (the target's visible pixels), `depths/*.png` (z-depth in mm, exact, the target's surface included),
 `reference.jpg` (the same scene with a matte target) and `group.json`. Finished groups are skipped.
 """
@@ -95,8 +95,8 @@ def fresnel(scene, flat: targets.Flat) -> np.ndarray:
 def plan(rng, kind: str, openings: float, empty: float = 0.0):
     """A furnished room around one target and opaque siblings of it, the camera turned to them.
 
-    `openings` scales how often a doorway or window can be seen; `empty` is the share of the siblings that are frames
-    without a panel.
+    `openings` scales how often a doorway or window can be seen; `empty` is the share of the flat siblings
+    that are frames without a panel.
     """
     if kind == "mirror" and rng.random() < 0.3:
         scene = rooms.make_room(rng, (2.0, 3.2), REAR, openings)

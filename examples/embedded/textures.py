@@ -79,7 +79,7 @@ def bricks(rng, base) -> np.ndarray:
     return np.clip(out, 0.02, 0.95)
 
 
-def stripes(rng, base, second, count=8) -> np.ndarray:
+def stripes(base, second, count=8) -> np.ndarray:
     out = np.empty((SIDE, SIDE, 3), np.float32)
     out[:] = base
     for k in range(count):
@@ -132,7 +132,7 @@ def card(rng) -> np.ndarray:
                 cv2.circle(out, (x, y), step // 4, tone, -1)
         return out
     if kind == 4:
-        return stripes(rng, paper, colour(rng), int(rng.choice([4, 6, 10])))
+        return stripes(paper, colour(rng), int(rng.choice([4, 6, 10])))
     return picture(rng)
 
 
@@ -158,7 +158,7 @@ def wall(rng) -> tuple[np.ndarray, float]:
     if kind == 1:
         return bricks(rng, np.array([0.5, 0.25, 0.18], np.float32) * rng.uniform(0.6, 1.5)), 0.8
     if kind == 2:
-        return stripes(rng, base, np.clip(base * rng.uniform(0.75, 1.15), 0.05, 0.92)), 1.6
+        return stripes(base, np.clip(base * rng.uniform(0.75, 1.15), 0.05, 0.92)), 1.6
     if kind == 3:
         return tiles(rng, base), 0.8
     return mottled(rng, colour(rng, 0.2, 0.8), 0.06), 2.0

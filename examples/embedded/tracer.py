@@ -1,7 +1,7 @@
 """Mitsuba (variant scalar_rgb) behind four calls: shading, coverage, what a mirror sees, what glass shows.
 
 Pictures are sums of noise-free parts in linear radiance: `direct` (one point light, shadows) and `albedo`
-(times an ambient term), both from four samples a pixel. A flat target is composed exactly: its soft coverage comes
+(times an ambient term), from four and two samples a pixel. A flat target is composed exactly: its soft coverage comes
 from the albedo of a white against a black target, its reflection from a second camera mirrored in its plane. Only
 solid glass is path-traced, in a crop around it.
 """

@@ -12,7 +12,7 @@ class Progress:
     """Lines go to stdout, the bar to stderr where that is a terminal. Only the main process speaks.
 
     Args:
-        total, done: updates of the whole run, and those of earlier sessions.
+        total, done: updates of the whole run, and those made before it was interrupted.
         enabled: False on all processes but one.
     """
 

@@ -15,7 +15,7 @@ from photos import capture, motion, moved, scene, target, with_content, write_ca
 from PIL import Image
 
 from gift_peft.cli import main
-from gift_peft.data import dataset_fingerprint, load_gift_i, register
+from gift_peft.data import dataset_fingerprint, load_gift_i
 from gift_peft.data.captures import prepare
 from gift_peft.data.matching import RegistrationSettings
 from gift_peft.data.prepare_arguments import PrepareSettings, parse_arguments
@@ -24,10 +24,7 @@ from gift_peft.data.quality import QualitySettings
 SIZE = (160, 200)
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    register()
-    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
+pytestmark = pytest.mark.usefixtures("fresh_cache")
 
 
 @pytest.fixture(scope="module")

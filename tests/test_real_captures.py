@@ -10,16 +10,13 @@ from photos import capture
 from PIL import Image
 from test_captures import statuses
 
-from gift_peft.data import load_gift_i, register
+from gift_peft.data import load_gift_i
 from gift_peft.data.captures import prepare
 
 SHARED = os.path.join(os.path.dirname(__file__), "..", "..", "shared", "data")
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    register()
-    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
+pytestmark = pytest.mark.usefixtures("fresh_cache")
 
 
 @pytest.mark.slow

@@ -28,13 +28,9 @@ from gift_peft.data.writer import write_gift_i
 from gift_peft.evaluation.predict import load_base, load_model
 from gift_peft.training import train
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # of libraries, about damaged files
+# the warnings are of libraries, about damaged files
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("fresh_cache")]
 FUZZ = 150  # inputs of each kind
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture(scope="module")

@@ -121,8 +121,8 @@ def plan(rng, kind: str, openings: float, empty: float = 0.0):
     for thing in row:
         scene.items += thing.holder
     target = row.pop(rng.integers(len(row)))  # nothing but what it is made of tells it from its siblings
-    framed = kind != "solid" and empty > 0
-    scene.items += [opaque(rng, twin) for twin in row if not framed or rng.random() >= empty]
+    surely_filled = kind == "solid" or empty == 0  # then nothing is drawn: groups do not depend on `empty`
+    scene.items += [opaque(rng, twin) for twin in row if surely_filled or rng.random() >= empty]
     nearest = sorted(row, key=lambda twin: np.linalg.norm(twin.centre - target.centre))[:2]
     targets.aim(rng, scene, np.mean([target.centre, *(twin.centre for twin in nearest)], axis=0))
     clear = [thing.centre[:2] for thing in (target, *row)]

@@ -31,6 +31,7 @@ def main() -> None:
     groups = [min((demo / "gift-i" / "validation").glob(f"{kind}_*")) for kind in KINDS]
     pictures = [min((group / "images").iterdir()) for group in groups]
     folder = run_report([demo], card=CARDS / "demo_adapter.md", zero_shot=pictures)
+    reduce(demo / "before_after.png", CARDS / "demo_before_after.png")
     for name, target in FIGURES.items():
         reduce(folder / f"{name}.png", CARDS / f"demo_{target}.png")
     reduce(folder / f"zero-shot-{demo.resolve().name}.png", CARDS / "demo_zero_shot.png")

@@ -110,6 +110,7 @@ def test_unknown_and_missing_arguments():
         ("snapshot_micro_batch_size", 0),
         ("snapshot_micro_batch_size", 4),  # with retain auto
         ("profile", -1),
+        ("eval_delay", -1),
         ("lambda_c", float("inf")),
         ("lambda_d", -1.0),
         ("lambda_d", float("nan")),

@@ -87,7 +87,7 @@ def test_embedded_assets_keep_their_promises():
     assert sum(path.stat().st_size for path in paths) < 16e6
     train, validation = (load_gift_i(root / "gift-i", split) for split in ("train", "validation"))
     kinds = [row.split("_")[0] for row in train["group_id"]]
-    assert [kinds.count(kind) for kind in KINDS] == [48, 48, 48]
+    assert [kinds.count(kind) for kind in KINDS] == [80, 80, 80]
     kinds = [row.split("_")[0] for row in validation["group_id"]]
     assert [kinds.count(kind) for kind in KINDS] == [8, 8, 8]
     assert not any(train["depths"]) and not any(train["reference"])  # the demo cannot look at them

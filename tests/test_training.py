@@ -142,6 +142,17 @@ def test_adapter_has_the_smallest_validation_gce(run, base_dir, groups):
     assert report.gce["adapted"] == best["val_gce"]
 
 
+@pytest.mark.parametrize(("delay", "validated"), [(2, [0, 6, 9]), (9, [0, 9])])
+def test_eval_delay_leaves_early_epochs_out_of_the_choice(run, base_dir, tree, tmp_path, delay, validated):
+    full = run[0].metrics
+    args = arguments(base_dir, tree, tmp_path, num_train_epochs=3, checkpointing_steps=None, seed=3, eval_delay=delay)
+    result = train(args)
+    late = [row for row in full if row["step"] in validated]
+    assert [row for row in result.metrics if row["val_gce"] is not None] == late  # and the weights are the same
+    assert [list(row) for row in result.metrics] == [KEYS] * 4
+    assert result.best_step == min(late[1:], key=lambda row: row["val_gce"])["step"]
+
+
 def test_first_distillation_is_exactly_zero(base_dir, tree, tmp_path):
     result = train(arguments(base_dir, tree, tmp_path / "out", max_steps=1))
     assert result.metrics[1]["distillation"] == 0

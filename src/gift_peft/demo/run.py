@@ -24,10 +24,11 @@ from gift_peft.training import parse_arguments, train
 SIZE = "112x140"
 KINDS = {"mirror": "mirror", "pane": "glass pane", "solid": "glass object"}
 # What differs from the paper's settings, because the model is 200 times smaller and the groups are fewer: so few
-# updates need a high learning rate, which must fall for depths to settle, and a long average of the gradient, which
-# comes from one group at a time. Chosen on part of the training groups.
-SETTINGS = ["--num_train_epochs=5", "--learning_rate=2e-4", "--lr_scheduler_type=linear", "--adam_beta1=0.97"]
-SETTINGS += ["--checkpoints_total_limit=1"]
+# updates need a high learning rate, which must fall for depths to settle, and less distillation to agree in time.
+# While the rate is high the predictions agree best where they have also moved most outside the target, so no epoch
+# before the last may be chosen. Found on part of the training groups and on groups that are not shipped.
+SETTINGS = ["--num_train_epochs=4", "--learning_rate=2e-4", "--lr_scheduler_type=linear", "--lambda_d=0.85"]
+SETTINGS += ["--eval_delay=4", "--checkpoints_total_limit=1"]
 
 
 def run_demo(
@@ -139,12 +140,13 @@ def _markdown(reports: dict[str, GiftIReport], args) -> str:
         f"| {label} | {base:.0f} | {adapted:.0f} | {100 * (adapted / base - 1):+.1f} % |"
         for label, base, adapted in _by_kind(reports["depth"])
     )
+    validated = min(max(args.eval_delay, 1), args.num_train_epochs)
     return f"""# GIFT on the embedded groups
 
 Rendered scenes, a base of two million weights that never saw a mirror or glass, {args.num_train_epochs} epochs,
-learning rate {args.learning_rate:g} ({args.lr_scheduler_type}), weights {args.lambda_c:g}:{args.lambda_d:g}, seed
-{args.seed}. These are results on rendered scenes; they show the method at work, not what a large model gains on
-photographs.
+learning rate {args.learning_rate:g} ({args.lr_scheduler_type}), Adam's beta1 {args.adam_beta1:g}, weights
+{args.lambda_c:g}:{args.lambda_d:g}, validated from epoch {validated} on, seed {args.seed}.
+These are results on rendered scenes; they show the method at work, not what a large model gains on photographs.
 
 ![RGB, true depth, base and adapted for a mirror, a pane and a glass object](before_after.png)
 

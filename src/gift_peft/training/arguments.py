@@ -104,6 +104,11 @@ class GiftTrainingArguments:
         "folder for groups at network size, shared by runs; default: gift-peft/groups in the Hugging Face cache", None
     )
 
+    eval_delay: int = _arg(
+        "epochs before the first validation, and so before adapter/ may be chosen; the end is always validated. While "
+        "the learning rate is high, the smallest GCE may be bought outside the target",
+        0,
+    )
     profile: int = _arg("time this many updates, print where the time goes, and stop", 0)
     checkpointing_steps: int | None = _arg("a checkpoint every so many updates; default: every epoch", None)
     checkpoints_total_limit: int | None = _arg("how many of the newest checkpoints are kept", 2)
@@ -141,7 +146,15 @@ class GiftTrainingArguments:
         ):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ValueError(f"{name}: must be at least 1, got {value}")
-        for name in ("lambda_c", "lambda_d", "weight_decay", "dataloader_num_workers", "profile", "seed"):
+        for name in (
+            "lambda_c",
+            "lambda_d",
+            "weight_decay",
+            "dataloader_num_workers",
+            "eval_delay",
+            "profile",
+            "seed",
+        ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: must be finite and not negative, got {getattr(self, name)}")
         if self.retain != "auto" and self.retain < 0:

@@ -266,11 +266,11 @@ class Run:
         return at and (not state.rows or state.rows[-1]["step"] != state.step)
 
     def finish_epoch(self, state: State, stop: SimpleNamespace) -> None:
-        """Validate, write the row, keep the adapter if it is the best so far, write the checkpoint if it is due.
+        """Validate, write the row, keep the adapter if it is the best so far, write the checkpoint, each if it is due.
 
         Raises Interrupted, with `state` as it was, if a signal comes meanwhile.
         """
-        measured = validation.validate(self, stop) | validation.measure_booster(self)
+        measured = validation.measure(self, state, stop)
         if state.step == 0:
             validation.measure_base(self, state)
         row = state.close_epoch(self.epoch_steps) | measured

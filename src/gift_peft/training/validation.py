@@ -52,11 +52,23 @@ def measure_base(run: Run, state: State) -> None:
         state.add(run.args.lambda_c * consistency, consistency, 0.0, num_pairs)
 
 
-def validate(run: Run, stop: SimpleNamespace) -> dict:
+def measure(run: Run, state: State, stop: SimpleNamespace) -> dict:
+    """The measured half of a row of metrics.jsonl; None between the base's row and epoch `eval_delay` or the end."""
+    keys = ["val_gce", *(f"val_{region}_{metric}" for region in REGIONS for metric in METRICS)]
+    if run.args.booster_root is not None:
+        keys += ["booster_tom_rmse", "booster_other_rmse"]
+    row = dict.fromkeys(keys)
+    if 0 < state.step < min(run.args.eval_delay * run.epoch_steps, run.total_steps):
+        return row
+    if run.validation_groups is not None:
+        row |= _validate(run, stop)
+    if run.args.booster_root is not None:
+        row |= _measure_booster(run)
+    return row
+
+
+def _validate(run: Run, stop: SimpleNamespace) -> dict:
     """GCE and the errors against the teacher on the treated reference, in float32, spread over the processes."""
-    keys = [f"val_{region}_{metric}" for region in REGIONS for metric in METRICS]
-    if run.validation_groups is None:
-        return dict.fromkeys(["val_gce", *keys])
     # Several processes evaluate their shares apart, and would have to agree after every group.
     alone = run.accelerator.num_processes == 1
     report = evaluate_gift_i(
@@ -71,10 +83,8 @@ def validate(run: Run, stop: SimpleNamespace) -> dict:
     return {"val_gce": report.gce["adapted"], **values}
 
 
-def measure_booster(run: Run) -> dict:
-    """RMSE in mm on Booster (protocol `gift`, a quarter of its size), where a root is given."""
-    if run.args.booster_root is None:
-        return {}
+def _measure_booster(run: Run) -> dict:
+    """RMSE in mm on Booster (protocol `gift`, a quarter of its size)."""
     report = evaluate_booster(
         run.args.booster_root,
         run.model,

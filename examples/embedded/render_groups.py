@@ -286,8 +286,9 @@ def make_group(seed: int, kind: str):
         if not np.isfinite(radiance).all() or depth.min() < 0.25 or depth.max() > 30:
             return None
         images.append(smaller(tracer.develop(radiance, exposure * rng.uniform(1 - spread, 1 + spread))))
+        # nearest, for no blending across edges; exact, or it would lie half a pixel off the picture
         millimetres = np.round(depth * 1000).astype(np.uint16)
-        depths.append(cv2.resize(millimetres, KEPT, interpolation=cv2.INTER_NEAREST))  # no blending across edges
+        depths.append(cv2.resize(millimetres, KEPT, interpolation=cv2.INTER_NEAREST_EXACT))
     return {
         "images": images,
         "mask": smaller(alpha) >= 0.5,

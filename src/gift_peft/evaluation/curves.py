@@ -100,7 +100,9 @@ def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Pat
             for name, epochs, values in curves:
                 number = names.index(name)
                 style = {"color": COLORS[number % len(COLORS)], "linestyle": DASHES[number % len(DASHES)]}
-                axis.plot(epochs, values, color=style["color"], alpha=0.25, linewidth=1)
+                # between few points a line is only a guess: they are marked
+                marker = "o" if len(values) < 10 else None
+                axis.plot(epochs, values, color=style["color"], alpha=0.25, linewidth=1, marker=marker)
                 axis.plot(
                     epochs, smooth(values, width or max(3, len(values) // 10 | 1)), label=name, linewidth=1.8, **style
                 )

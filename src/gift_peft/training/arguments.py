@@ -23,7 +23,7 @@ FREE_TO_CHANGE = {
     "proxies_dir",
     "output_dir",
     "overwrite_output_dir",
-    "num_train_epochs",  # a longer run has the shorter one as its beginning, unless the learning rate falls: FALLING
+    "num_train_epochs",  # a longer run has the shorter one as its beginning, but not always: FALLING
     "max_steps",
     "retain",  # gradients do not depend on it, to the bit on CPU
     "dataloader_num_workers",
@@ -42,7 +42,10 @@ FREE_TO_CHANGE = {
     "hub_private_repo",
     "config",
 }
-FALLING = {"num_train_epochs", "max_steps"}  # part of what a run is where its learning rate falls over its length
+FALLING = {
+    "num_train_epochs",
+    "max_steps",
+}  # part of what a run is where its learning rate falls over its length, or eval_delay counts on its end
 
 
 def _arg(text: str, default=...):
@@ -119,7 +122,7 @@ class GiftTrainingArguments:
     resume_from_checkpoint: str | None = _arg(
         "a checkpoint-<step> folder, or latest: the newest complete one in output_dir", None
     )
-    booster_root: str | None = _arg("Booster's folder: ToM and Other RMSE on it after every epoch", None)
+    booster_root: str | None = _arg("Booster's folder: ToM and Other RMSE on it at every validation", None)
     report_to: Literal["none", "tensorboard", "trackio"] = _arg("experiment tracker", "none")
     license: str | None = _arg("licence named in the card; default: the base model's where known", None)
     push_to_hub: bool = _arg("upload the adapter when training has ended (token: hf auth login)", False)

@@ -1,7 +1,8 @@
 """A GIFT run from arguments to adapter (paper section 4, implementation details): the loop, top to bottom.
 
 Frozen model -> proxies -> adapter with the paper's trainable parts -> one Adam update per group of images, the groups
-shuffled once per epoch -> validation after every epoch -> the adapter with the smallest validation GCE.
+shuffled once per epoch -> validation after every epoch (from `eval_delay` on) -> the adapter with the smallest
+validation GCE.
 """
 
 import hashlib
@@ -189,7 +190,8 @@ class Run:
     def _identity(self) -> dict:
         """What must be the same for a resumed run, under the names of the arguments."""
         args = self.args
-        free = FREE_TO_CHANGE - (FALLING if args.lr_scheduler_type == "linear" else set())
+        fixed_length = args.lr_scheduler_type == "linear" or args.eval_delay
+        free = FREE_TO_CHANGE - (FALLING if fixed_length else set())
         identity = {k: v for k, v in asdict(args).items() if k not in free}
         parts = [groups for groups in (self.train_groups, self.validation_groups) if groups]
         fingerprint = [None]

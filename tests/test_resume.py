@@ -217,6 +217,13 @@ def test_a_longer_run_has_the_shorter_as_its_beginning(args, base_dir, tree, who
     assert len((longer / "metrics.jsonl").read_text().splitlines()) == 4
 
 
+def test_with_eval_delay_the_length_is_part_of_the_run(args, tree, tmp_path, base_dir):
+    """The shorter run's end was validated, which in a longer one comes too early to be chosen."""
+    train(arguments(base_dir, tree, tmp_path / "out", max_steps=2, eval_delay=9))
+    with pytest.raises(ValueError, match=r"resume_from_checkpoint: max_steps: 2 became 4, it has changed"):
+        train_again(args, max_steps=4, eval_delay=9)
+
+
 @pytest.mark.parametrize(("name", "value"), [("learning_rate", 1e-3), ("seed", 5), ("head", "lora")])
 def test_other_arguments_are_refused_by_name_and_nothing_is_written(name, value, args, whole, tmp_path):
     shutil.copytree(whole, tmp_path / "out")

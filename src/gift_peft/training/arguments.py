@@ -23,7 +23,7 @@ FREE_TO_CHANGE = {
     "proxies_dir",
     "output_dir",
     "overwrite_output_dir",
-    "num_train_epochs",  # a longer run has the shorter one as its beginning, but not always: FALLING
+    "num_train_epochs",  # a longer run has the shorter one as its beginning, but not always: LENGTH
     "max_steps",
     "retain",  # gradients do not depend on it, to the bit on CPU
     "dataloader_num_workers",
@@ -42,10 +42,8 @@ FREE_TO_CHANGE = {
     "hub_private_repo",
     "config",
 }
-FALLING = {
-    "num_train_epochs",
-    "max_steps",
-}  # part of what a run is where its learning rate falls over its length, or eval_delay counts on its end
+# Part of what a run is where its learning rate falls over its length, or where eval_delay lets its end be chosen.
+LENGTH = {"num_train_epochs", "max_steps"}
 
 
 def _arg(text: str, default=...):

@@ -30,7 +30,7 @@ from gift_peft.evaluation.tables import relative_change
 from gift_peft.files import jsonable
 from gift_peft.group_step import GroupStep
 from gift_peft.training import card, checkpoints, validation
-from gift_peft.training.arguments import FALLING, FREE_TO_CHANGE, GiftTrainingArguments
+from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
 from gift_peft.training.groups import PreparedGroups, epoch_order
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress
@@ -191,7 +191,7 @@ class Run:
         """What must be the same for a resumed run, under the names of the arguments."""
         args = self.args
         fixed_length = args.lr_scheduler_type == "linear" or args.eval_delay
-        free = FREE_TO_CHANGE - (FALLING if fixed_length else set())
+        free = FREE_TO_CHANGE - (LENGTH if fixed_length else set())
         identity = {k: v for k, v in asdict(args).items() if k not in free}
         parts = [groups for groups in (self.train_groups, self.validation_groups) if groups]
         fingerprint = [None]

@@ -33,7 +33,7 @@ REAR = 2.0, 4.0  # metres of the room behind the camera, for a mirror to show
 OPENINGS = 0.3  # doors are mostly closed when a group is taken: this share of the usual doorways and windows
 KEPT = 160, 128  # pixels across and down: many groups teach more than large pictures of few
 JPEG = {"quality": 95, "optimize": True, "progressive": True}
-FIRST_SEED = {"train": 0, "validation": 2_000_000}
+FIRST_SEED = {"train": 0, "validation": 3_000_000}
 
 
 def clutter(rng, count, x_range, y_range) -> list[shapes.Item]:

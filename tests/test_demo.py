@@ -65,6 +65,7 @@ def test_demo_leaves_everything_it_promises(embedded, tmp_path, monkeypatch, cap
         run.run_demo("demo")
     run.run_demo("demo", overwrite_output_dir=True, seed=1, extra=["--max_steps=1"])
     assert len(Path("demo/metrics.jsonl").read_text().splitlines()) == 2
+    assert "1 updates" in Path("demo/report.md").read_text() and "1 epochs" in text
 
 
 @pytest.mark.parametrize("argument", ["--output_dir=x", "--dataset_name=mine", "--model_name_or_path=x/base"])
@@ -87,7 +88,7 @@ def test_embedded_assets_keep_their_promises():
     assert sum(path.stat().st_size for path in paths) < 16e6
     train, validation = (load_gift_i(root / "gift-i", split) for split in ("train", "validation"))
     kinds = [row.split("_")[0] for row in train["group_id"]]
-    assert [kinds.count(kind) for kind in KINDS] == [80, 80, 80]
+    assert [kinds.count(kind) for kind in KINDS] == [106, 106, 106]
     kinds = [row.split("_")[0] for row in validation["group_id"]]
     assert [kinds.count(kind) for kind in KINDS] == [8, 8, 8]
     assert not any(train["depths"]) and not any(train["reference"])  # the demo cannot look at them

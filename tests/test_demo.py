@@ -63,7 +63,8 @@ def test_demo_leaves_everything_it_promises(embedded, tmp_path, monkeypatch, cap
 
     with pytest.raises(ValueError, match=r"demo already holds a run; --overwrite_output_dir"):
         run.run_demo("demo")
-    run.run_demo("demo", overwrite_output_dir=True, seed=1, extra=["--max_steps=1"])
+    assert "channels_last: true" in Path("demo/config.yaml").read_text()
+    run.run_demo("demo", overwrite_output_dir=True, seed=1, extra=["--max_steps=1", "--head=lora"])
     assert len(Path("demo/metrics.jsonl").read_text().splitlines()) == 2
     assert "1 updates" in Path("demo/report.md").read_text() and "1 epochs" in text
 

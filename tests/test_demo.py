@@ -69,6 +69,29 @@ def test_demo_leaves_everything_it_promises(embedded, tmp_path, monkeypatch, cap
     assert "1 updates" in Path("demo/report.md").read_text() and "1 epochs" in text
 
 
+@pytest.mark.parametrize(
+    ("options", "channels_last"),
+    [
+        ([], True),
+        (["--head=lora"], False),
+        (["--channels_last=false"], False),
+        (["--channels-last", "false"], False),
+        (["--head=lora", "--channels_last"], True),  # refused by the training, which says why
+    ],
+)
+def test_the_demo_is_channels_last_where_it_can_and_may_be(embedded, tmp_path, monkeypatch, options, channels_last):
+    asked = []
+
+    def stop(args):
+        asked.append(args)
+        raise InterruptedError
+
+    monkeypatch.setattr(run, "train", stop)
+    with pytest.raises(InterruptedError):
+        run.run_demo(tmp_path / "demo", extra=options)
+    assert asked[0].channels_last is channels_last
+
+
 @pytest.mark.parametrize("argument", ["--output_dir=x", "--dataset_name=mine", "--model_name_or_path=x/base"])
 def test_what_the_demo_brings_itself_is_not_replaced(embedded, tmp_path, argument):
     name = argument[2:].split("=")[0]

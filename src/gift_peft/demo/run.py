@@ -8,10 +8,12 @@ import os
 import shutil
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib.resources import as_file, files
 from pathlib import Path
 
 from gift_peft.data.gift_i import load_gift_i
+from gift_peft.evaluation.cards import run_length
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.figures import before_after
 from gift_peft.evaluation.panels import group_panels
@@ -50,13 +52,13 @@ def run_demo(
         ValueError: `out` holds a run already, or an argument is wrong.
     """
     out = Path(out)
-    argv = [f"--model_name_or_path={out}/base", f"--dataset_name={out}/gift-i", f"--output_dir={out}"]
-    argv += [f"--size={SIZE}", f"--seed={seed}", *SETTINGS, "--license=apache-2.0", *extra]
+    own = [f"--model_name_or_path={out}/base", f"--dataset_name={out}/gift-i", f"--output_dir={out}"]
+    own += [f"--size={SIZE}", f"--seed={seed}", *SETTINGS, "--license=apache-2.0"]
     if overwrite_output_dir:
-        argv.append("--overwrite_output_dir")
-    args = parse_arguments(argv)
-    if args.head == "full" and not any(option.startswith("--channels_last") for option in extra):
-        args.channels_last = True
+        own.append("--overwrite_output_dir")
+    args = parse_arguments([*own, *extra])
+    if args.head == "full":  # a default like the others: what `extra` says still wins
+        args = parse_arguments([*own, "--channels_last", *extra])
     for name, value in (("model_name_or_path", f"{out}/base"), ("dataset_name", f"{out}/gift-i"), ("output_dir", out)):
         if Path(getattr(args, name)) != Path(value):
             raise ValueError(f"{name}: the demo has its own; choose the folder with --out, or use `gift-peft train`")
@@ -145,10 +147,9 @@ def _markdown(reports: dict[str, GiftIReport], args) -> str:
         f"| {label} | {base:.0f} | {adapted:.0f} | {100 * (adapted / base - 1):+.1f} % |"
         for label, base, adapted in _by_kind(reports["depth"])
     )
-    length = f"{args.max_steps} updates" if args.max_steps > 0 else f"{args.num_train_epochs} epochs"
     return f"""# GIFT on the embedded groups
 
-Rendered scenes, a base of two million weights that never saw a mirror or glass, {length},
+Rendered scenes, a base of two million weights that never saw a mirror or glass, {run_length(asdict(args))},
 learning rate {args.learning_rate:g} ({args.lr_scheduler_type}), Adam's beta1 {args.adam_beta1:g}, weights
 {args.lambda_c:g}:{args.lambda_d:g}, eval_delay {args.eval_delay}, seed {args.seed}.
 These are results on rendered scenes; they show the method at work, not what a large model gains on photographs.

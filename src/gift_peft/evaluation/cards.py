@@ -213,7 +213,7 @@ def _recipe(arguments: Mapping, record: Mapping | None, base: Base | None) -> st
         f"| loss | consistency : distillation = {_get(arguments, 'lambda_c', 1)}:{_get(arguments, 'lambda_d', 1)} |",
         f"| optimisation | Adam, learning rate {_get(arguments, 'learning_rate', 2e-5)} "
         f"({arguments.get('lr_scheduler_type', 'constant')}), weight decay {_get(arguments, 'weight_decay', 0)}, "
-        f"{_epochs(arguments)}, one update per group |",
+        f"{run_length(arguments)}, one update per group |",
         f"| precision | {_precision(precision, base)} |",
     ]
     text = "\n".join(rows)
@@ -233,7 +233,8 @@ def _get(arguments: Mapping, name: str, default: float) -> str:
     return f"{float(arguments.get(name, default)):g}"
 
 
-def _epochs(arguments: Mapping) -> str:
+def run_length(arguments: Mapping[str, Any]) -> str:
+    """How long a training with these arguments is: "50 epochs", or "300 updates" where `max_steps` says so."""
     steps = int(arguments.get("max_steps", -1))
     return f"{steps} updates" if steps > 0 else f"{arguments.get('num_train_epochs', 50)} epochs"
 

@@ -1,6 +1,6 @@
 """The pictures and the card of the demo's report, as `model_cards/` shows them.
 
-    gift-peft demo --out DEMO --checkpoint_at_steps 636,1590
+    gift-peft demo --out DEMO --checkpoint_at_steps 636,1272
     python examples/embedded/report_pictures.py DEMO
 
 Runs `gift-peft report` on the demo (needs the extra `plots`), reduces its figures to 920 pixels and a palette and,

@@ -14,7 +14,8 @@ from pathlib import Path
 
 from gift_peft.evaluation.evaluate import run_evaluation
 from gift_peft.evaluation.report import run_report
-from gift_peft.training import parse_arguments, train
+from gift_peft.training import train
+from gift_peft.training.arguments import parse_arguments
 
 RATIOS = [(1.0, 1.0), (1.0, 1.5), (1.0, 2.0), (2.0, 1.0), (1.0, 0.0)]  # (lambda_c, lambda_d)
 OURS = ("lambda_c", "lambda_d", "resume_from_checkpoint", "overwrite_output_dir", "push_to_hub")

@@ -18,8 +18,8 @@ import numpy as np
 from PIL import Image
 
 from gift_peft import evaluate_booster
-from gift_peft.data.preprocess import parse_size
 from gift_peft.evaluation.tables import text_table
+from gift_peft.models.pixels import parse_size
 
 CALIBRATION = """<?xml version="1.0"?>
 <opencv_storage>

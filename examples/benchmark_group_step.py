@@ -37,7 +37,7 @@ from PIL import Image
 
 from gift_peft.adapters import get_gift_model
 from gift_peft.data.gift_i import load_gift_i
-from gift_peft.data.preprocess import Group
+from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.predict import load_base
 from gift_peft.group_step import GroupStep
 from gift_peft.training import profiling

@@ -9,7 +9,8 @@ import torch
 from accelerate.state import AcceleratorState
 from safetensors.torch import load_file
 
-from gift_peft.training import GiftTrainingArguments, TrainResult, train
+from gift_peft.training import TrainResult, train
+from gift_peft.training.arguments import GiftTrainingArguments
 
 
 def arguments(base: Path, tree: Path, out: Path, **changes) -> GiftTrainingArguments:

@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from gift_peft.training import GiftTrainingArguments, parse_arguments
+from gift_peft.training.arguments import GiftTrainingArguments, parse_arguments
 
 REQUIRED = ["--model_name_or_path", "m", "--dataset_name", "d", "--output_dir", "o"]
 

@@ -15,8 +15,8 @@ from photos import capture, motion, moved, scene, target, with_content, write_ca
 from PIL import Image
 
 from gift_peft.cli import main
-from gift_peft.data import dataset_fingerprint, load_gift_i
 from gift_peft.data.captures import prepare
+from gift_peft.data.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.data.matching import RegistrationSettings
 from gift_peft.data.prepare_arguments import PrepareSettings, parse_arguments
 from gift_peft.data.quality import QualitySettings

@@ -27,7 +27,8 @@ from gift_peft.evaluation import cards
 from gift_peft.evaluation.bases import adapter_sizes, find_base
 from gift_peft.evaluation.card_metadata import base_license, is_local, portable_name
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.training import GiftTrainingArguments, card, loop, start, train
+from gift_peft.training import card, loop, start, train
+from gift_peft.training.arguments import GiftTrainingArguments
 
 ROW = {"step": 0, "epoch": 0, "val_gce": 0.5} | {
     f"val_{region}_{metric}": 0.25 for region in ("tom", "other", "all") for metric in METRICS

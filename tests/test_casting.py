@@ -10,9 +10,8 @@ from group_tools import gift_model, gradients, group, largest_error
 from torch import nn
 
 from gift_peft import group_step
-from gift_peft.casting import cast_frozen_once
 from gift_peft.group_step import GroupStep
-from gift_peft.retention import graph_bytes
+from gift_peft.memory import cast_frozen_once, graph_bytes
 
 
 @pytest.fixture
@@ -31,7 +30,7 @@ def assert_unchanged(model, before):
     for name, p in model.named_parameters():
         assert p is before[name][0] and p.dtype == before[name][1] and torch.equal(p, before[name][2])
     hooks = [h for m in model.modules() for h in (*m._forward_hooks.values(), *m._forward_pre_hooks.values())]
-    assert not any(hook.__module__ == "gift_peft.casting" for hook in hooks)  # transformers has some of its own
+    assert not any(hook.__module__ == "gift_peft.memory" for hook in hooks)  # transformers has some of its own
 
 
 @pytest.mark.parametrize("retain", [0, 2, 5])

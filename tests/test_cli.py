@@ -125,7 +125,7 @@ def test_ctrl_c_before_training_is_130(run, monkeypatch):
     def interrupt(argv):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gift_peft.training.parse_arguments", interrupt)
+    monkeypatch.setattr("gift_peft.training.arguments.parse_arguments", interrupt)
     assert run("train")[0] == 130
 
 

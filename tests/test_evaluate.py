@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gift_peft.data.preprocess import Group
+from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.results import REGIONS, GiftIReport
 from gift_peft.evaluation.scoring import consensus

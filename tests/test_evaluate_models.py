@@ -72,7 +72,7 @@ def test_the_train_split_has_gce_and_no_accuracy(raw_tree, adapter_model):
 
 
 def test_run_evaluation_prints_and_writes(raw_tree, base_dir, tmp_path, adapter_model, capsys):
-    from gift_peft.adapters import save_adapter
+    from gift_peft.adapter_folder import save_adapter
 
     adapter = tmp_path / "adapter"
     with pytest.warns(UserWarning, match="local"):

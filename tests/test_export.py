@@ -12,7 +12,8 @@ from tiny import write_group, write_raw_tree
 
 from gift_peft.cli import main
 from gift_peft.data.export import export_parquet
-from gift_peft.data.gift_i import FEATURES, IMAGE_COLUMNS, load_gift_i
+from gift_peft.data.gift_i import FEATURES, load_gift_i
+from gift_peft.data.rows import IMAGE_COLUMNS
 from gift_peft.data.writer import write_gift_i
 
 

@@ -12,9 +12,9 @@ from torch import nn
 from transformers import DPTConfig, DPTForDepthEstimation, DPTImageProcessorPil
 
 from gift_peft import evaluate_booster
-from gift_peft.data.preprocess import to_pixel_values
 from gift_peft.evaluation.evaluate import run_booster, run_evaluation
 from gift_peft.evaluation.predict import load_model, predict_depth, predict_images
+from gift_peft.models.pixels import to_pixel_values
 
 RAMP = torch.linspace(1, 2, 98)
 

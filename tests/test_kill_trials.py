@@ -10,7 +10,8 @@ import pytest
 from runs import arguments, assert_same_run
 from tiny import write_raw_tree
 
-from gift_peft.training import GiftTrainingArguments, train
+from gift_peft.training import train
+from gift_peft.training.arguments import GiftTrainingArguments
 
 TRIALS = 30
 

@@ -7,9 +7,9 @@ import pytest
 from photos import capture, motion
 from PIL import Image
 
-from gift_peft.data import load_gift_i
+from gift_peft.captures.foreign import read_layout
 from gift_peft.data.captures import prepare
-from gift_peft.data.layout import read_layout
+from gift_peft.data.gift_i import load_gift_i
 from gift_peft.data.prepare_arguments import PrepareSettings
 from gift_peft.data.registration import warp
 

@@ -28,7 +28,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from gift_peft.data.masks import MaskSource, find_mask, is_mask_file
+from gift_peft.captures.masks import MaskSource, find_mask, is_mask_file
 
 
 @pytest.fixture

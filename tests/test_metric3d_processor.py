@@ -7,8 +7,8 @@ from backbones import picture
 from PIL import Image
 from transformers.modeling_outputs import DepthEstimatorOutput
 
-from gift_peft.data.preprocess import to_pixel_values
 from gift_peft.models.metric3d import Metric3DImageProcessorPil
+from gift_peft.models.pixels import to_pixel_values
 
 
 def close(actual, expected, tolerance):

@@ -14,16 +14,9 @@ from PIL import Image
 from tiny import SIZE, tiny_processor
 from transformers import DPTImageProcessor, pipeline
 
-from gift_peft.data.preprocess import (
-    collate_group,
-    image_digest,
-    open_image,
-    read_image,
-    resize_mask,
-    resolve_size,
-    to_mask,
-    to_pixel_values,
-)
+from gift_peft.dataset.tensors import collate_group
+from gift_peft.images import image_digest, open_image, read_image, to_mask
+from gift_peft.models.pixels import resize_mask, resolve_size, to_pixel_values
 
 RNG = np.random.default_rng(0)
 PICTURE = RNG.integers(0, 255, (40, 60, 3), dtype=np.uint8)

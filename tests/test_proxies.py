@@ -13,11 +13,11 @@ from PIL import Image
 from records import one_line
 from tiny import SIZE, tiny_model, tiny_processor, write_base
 
-from gift_peft.data import load_gift_i
-from gift_peft.data.preprocess import collate_group
-from gift_peft.data.proxies import default_proxies_dir, read_header, write_proxies
+from gift_peft.data.gift_i import load_gift_i
+from gift_peft.data.proxies import default_proxies_dir, read_header, teacher_id, teacher_revision, write_proxies
+from gift_peft.dataset.tensors import collate_group
 from gift_peft.training import teacher
-from gift_peft.training.teacher import make_proxies, teacher_id, teacher_revision
+from gift_peft.training.teacher import make_proxies
 
 pytestmark = pytest.mark.usefixtures("fresh_cache")
 

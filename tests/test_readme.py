@@ -10,7 +10,7 @@ from tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
 
 from gift_peft import get_gift_model, save_adapter
 from gift_peft.cli import main
-from gift_peft.training import parse_arguments
+from gift_peft.training.arguments import parse_arguments
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -7,9 +7,9 @@ import torch
 from group_tools import Toy, gradients, group, largest_error, toy
 from torch import nn
 
-from gift_peft import retention
+from gift_peft import memory
 from gift_peft.group_step import GroupStep
-from gift_peft.retention import GraphBudget, available_memory, graph_bytes
+from gift_peft.memory import GraphBudget, available_memory, graph_bytes
 
 GIB = 2**30
 
@@ -19,8 +19,8 @@ def step_with_room_for(images, model, data, monkeypatch):
     pixels, mask = data[0], data[1]
     size = graph_bytes(model, lambda: model(pixel_values=pixels[:2]), pixels)[1]
     reserved = 4 * sum(p.nbytes for p in model.parameters())
-    needed = images * (size // 2) + retention.GROUP_TENSORS * mask.numel() * pixels.element_size() + size + reserved
-    monkeypatch.setattr(retention, "available_memory", lambda: int(needed / retention.CPU_SHARE) + 4)
+    needed = images * (size // 2) + memory.GROUP_TENSORS * mask.numel() * pixels.element_size() + size + reserved
+    monkeypatch.setattr(memory, "available_memory", lambda: int(needed / memory.CPU_SHARE) + 4)
     model.seen.clear()
     return GroupStep(model)
 
@@ -162,7 +162,7 @@ def cgroup(folder, **files):
 
 def rooms(tmp_path, lines):
     (tmp_path / "cgroup").write_text(lines)
-    return sorted(retention._cgroup_rooms(tmp_path / "cgroup", tmp_path / "fs"))
+    return sorted(memory._cgroup_rooms(tmp_path / "cgroup", tmp_path / "fs"))
 
 
 def test_cgroup_v2_limits_of_the_group_and_those_above(tmp_path):
@@ -184,19 +184,19 @@ def test_cgroup_v1_and_the_hosts_path_in_a_container(tmp_path):
 
 
 def test_no_cgroups(tmp_path):
-    assert list(retention._cgroup_rooms(tmp_path / "nothing", tmp_path)) == []
+    assert list(memory._cgroup_rooms(tmp_path / "nothing", tmp_path)) == []
     assert rooms(tmp_path, "0::/\n") == []
 
 
 def test_a_cgroup_limits_what_is_available(monkeypatch):
-    monkeypatch.setattr(retention, "_cgroup_rooms", lambda: iter([GIB // 4, GIB]))
+    monkeypatch.setattr(memory, "_cgroup_rooms", lambda: iter([GIB // 4, GIB]))
     assert available_memory() == GIB // 4
-    monkeypatch.setattr(retention, "_cgroup_rooms", lambda: iter([-5]))
+    monkeypatch.setattr(memory, "_cgroup_rooms", lambda: iter([-5]))
     assert available_memory() == 0
 
 
 def test_processes_of_a_machine_share_its_memory(monkeypatch):
-    monkeypatch.setattr(retention, "available_memory", lambda: GIB)
+    monkeypatch.setattr(memory, "available_memory", lambda: GIB)
     model, (pixels, *_) = toy(), group(2, torch.float32)
     assert str(GraphBudget(model)) == "retain auto: nothing measured yet"
     sizes = []
@@ -205,13 +205,13 @@ def test_processes_of_a_machine_share_its_memory(monkeypatch):
         budget.measure(pixels, lambda x: model(pixel_values=x))
         sizes.append(budget.bytes)
         assert f"up to {budget.bytes / 2**20:.0f} MiB" in str(budget)
-    assert sizes[0] - sizes[1] == int(GIB * retention.CPU_SHARE / 2)
+    assert sizes[0] - sizes[1] == int(GIB * memory.CPU_SHARE / 2)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
-    assert retention.local_processes(16) == 4
+    assert memory.local_processes(16) == 4
 
 
 def test_room_is_left_for_gradients_and_adam(monkeypatch):
-    monkeypatch.setattr(retention, "available_memory", lambda: GIB)
+    monkeypatch.setattr(memory, "available_memory", lambda: GIB)
     small, large = nn.Conv2d(3, 1, 1), nn.Sequential(nn.Conv2d(3, 1, 1), nn.Linear(1000, 1000))
     difference = GraphBudget(small)._free() - GraphBudget(large)._free()
     assert difference == 4 * sum(p.nbytes for p in large[1].parameters())

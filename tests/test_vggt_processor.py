@@ -8,8 +8,8 @@ from PIL import Image
 from transformers import pipeline
 from transformers.modeling_outputs import DepthEstimatorOutput
 
-from gift_peft.data.preprocess import to_pixel_values
 from gift_peft.models import register_models
+from gift_peft.models.pixels import to_pixel_values
 from gift_peft.models.vggt import VggtForDepthEstimation, VggtImageProcessorPil
 
 

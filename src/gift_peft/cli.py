@@ -197,7 +197,7 @@ def _export(args: argparse.Namespace, rest: list[str]) -> int:
 
 
 def _train(args: argparse.Namespace, rest: list[str]) -> int:
-    from gift_peft.training import parse_arguments
+    from gift_peft.training.arguments import parse_arguments
 
     arguments = parse_arguments(rest)
     from gift_peft.training import train  # after the arguments are known to be right: this takes seconds

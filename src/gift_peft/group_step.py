@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
-from gift_peft.casting import cast_frozen_once
 from gift_peft.losses import GiftLoss, gift_loss, require_finite
-from gift_peft.retention import GraphBudget, local_processes
+from gift_peft.memory import GraphBudget, cast_frozen_once, local_processes
 
 if TYPE_CHECKING:
     from accelerate import Accelerator

@@ -15,8 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gift_peft.data.preprocess import SINGLE_CHANNEL, is_image_file, open_image, to_mask
-from gift_peft.data.raw import natural_key
+from gift_peft.images import SINGLE_CHANNEL, is_image_file, natural_key, open_image, to_mask
 
 SUBSETS = ("balanced", "unbalanced")
 OCCLUSIONS = ("all", "noc")

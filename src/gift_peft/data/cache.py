@@ -19,9 +19,10 @@ import safetensors
 import safetensors.numpy
 import safetensors.torch
 
-from gift_peft.data.preprocess import Group, pixel_settings, resize_row, to_group
 from gift_peft.data.proxies import METADATA, row_digests
+from gift_peft.dataset.tensors import Group, resize_row, to_group
 from gift_peft.files import write_whole
+from gift_peft.models.pixels import pixel_settings
 
 FORMAT = "gift-peft group 1"
 PICTURES = ("images", "masks", "valids")

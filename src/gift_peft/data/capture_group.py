@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from gift_peft.captures.foreign import read_proxy
+from gift_peft.captures.tree import Capture, check_masks, decode_capture
 from gift_peft.data.capture_job import Job, Outcome, capture_digest
-from gift_peft.data.layout import read_proxy
 from gift_peft.data.matching import Frame
 from gift_peft.data.quality import Small, check_frames, check_group_change, pairwise_changes
-from gift_peft.data.raw import Capture, check_count, check_masks, decode_capture
 from gift_peft.data.registration import Registration, reason, register, valid_area, warp, warp_stored
-from gift_peft.data.writer import check_group_id, write_group
+from gift_peft.data.writer import write_group
+from gift_peft.rules import check_count, check_group_id
 
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything
 

@@ -17,8 +17,8 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.data.preprocess import open_image
 from gift_peft.files import write_whole
+from gift_peft.images import open_image
 
 WIDTH = 240  # of the thumbnails, in pixels
 AMPLIFY = 4  # of the differences

@@ -70,12 +70,13 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 import gift_peft
+from gift_peft.captures.tree import find_groups
 from gift_peft.data.capture_group import prepare_group
 from gift_peft.data.capture_job import FORMAT, Job, Outcome
 from gift_peft.data.prepare_arguments import PrepareSettings
-from gift_peft.data.raw import SPLITS, find_groups
 from gift_peft.data.writer import write_card, write_rows
 from gift_peft.files import write_whole
+from gift_peft.rules import SPLITS
 
 STATE = ".prepare"  # in OUT: one record per finished group, and groups on their way
 BESIDE = ("masks_proposed", "proxies_given")  # what a group may leave in OUT besides its folder

@@ -25,11 +25,11 @@ from datasets.builder import Key
 from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
-from gift_peft.data.preprocess import SURFACES, image_digest, to_mask
+from gift_peft.captures.tree import list_groups, raw_example
 from gift_peft.data.proxies import FORMAT, ProxyStore, default_proxies_dir, teacher_id, teacher_revision
-from gift_peft.data.raw import SPLITS, check_count, list_groups, natural_key, raw_example
 from gift_peft.data.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
-from gift_peft.data.writer import check_group_id
+from gift_peft.images import image_digest, natural_key, to_mask
+from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
 
 FEATURES = Features(
     {
@@ -101,12 +101,13 @@ def register() -> None:
     """
     from datasets import packaged_modules
 
-    from gift_peft.data import annotations, masks, preprocess, raw
+    from gift_peft import images, rules
+    from gift_peft.captures import annotations, masks, tree
 
     # The hash names the cache: of everything that decides what a raw tree becomes.
     lines = [
         line
-        for module in (sys.modules[__name__], raw, masks, annotations, preprocess)
+        for module in (sys.modules[__name__], tree, masks, annotations, images, rules)
         for line in _source_lines(module)
     ]
     packaged_modules._PACKAGED_DATASETS_MODULES["gift_i"] = (__name__, packaged_modules._hash_python_lines(lines))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import yaml
 
-from gift_peft.data.layout import Layout, read_layout
+from gift_peft.captures.foreign import Layout, read_layout
 from gift_peft.data.matching import RegistrationSettings
 from gift_peft.data.quality import QualitySettings
 

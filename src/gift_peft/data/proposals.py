@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from gift_peft.data.preprocess import to_pixel_values
+from gift_peft.models.pixels import to_pixel_values
 
 WORKING_SIDE = 512  # pixels; a proposal is no finer, and averaging takes sensor noise out
 LIGHTNESS_WEIGHT = 0.7  # of L against a and b: shadows change lightness most

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 import safetensors
 
-from gift_peft.data.preprocess import image_digest
 from gift_peft.files import write_whole
+from gift_peft.images import image_digest
 
 if TYPE_CHECKING:
     import torch

@@ -13,8 +13,9 @@ from datasets import formatting
 from datasets.formatting.formatting import Formatter
 from PIL import Image
 
-from gift_peft.data.preprocess import check_group, label_items, open_image, to_mask, to_rgb
 from gift_peft.data.proxies import ProxyStore
+from gift_peft.images import open_image, to_mask, to_rgb
+from gift_peft.rules import check_group, label_items
 
 FORMAT_TYPE = "gift_i"
 IMAGE_COLUMNS = ("images", "masks", "valids", "depths")

@@ -17,9 +17,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from gift_peft.data.preprocess import SURFACES, check_group, image_digest, label_items, open_image, to_mask, to_rgb
-from gift_peft.data.raw import SPLITS
 from gift_peft.files import write_whole
+from gift_peft.images import image_digest, open_image, to_mask, to_rgb
+from gift_peft.rules import SPLITS, SURFACES, check_group, check_group_id, label_items
 
 NAMES = pa.list_(pa.string())
 SCHEMA = pa.schema(
@@ -175,12 +175,6 @@ def write_group(group: dict, root: Path) -> dict:
         **{f"{kind}_file_names": paths for kind, paths in files.items()},
         "reference_file_name": reference_file,
     }
-
-
-def check_group_id(group_id: str) -> None:
-    """Raise ValueError unless a group's id can name a folder and a proxy file."""
-    if not group_id or group_id.startswith(".") or re.search(r'[/\\:*?"<>|\0]', group_id):
-        raise ValueError(f"group id {group_id!r}: it names a folder, so no separators and no leading dot")
 
 
 def _default_names(images: list) -> list[str]:

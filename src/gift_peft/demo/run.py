@@ -21,7 +21,8 @@ from gift_peft.evaluation.predict import load_model
 from gift_peft.evaluation.results import GiftIReport
 from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.files import write_whole
-from gift_peft.training import parse_arguments, train
+from gift_peft.training import train
+from gift_peft.training.arguments import parse_arguments
 
 SIZE = "112x140"
 KINDS = {"mirror": "mirror", "pane": "glass pane", "solid": "glass object"}

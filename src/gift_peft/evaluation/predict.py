@@ -18,11 +18,11 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.data.preprocess import is_image_file, read_image, resolve_size, to_pixel_values
 from gift_peft.data.proxies import check_base_name, teacher_revision
-from gift_peft.data.raw import natural_key
 from gift_peft.evaluation.colormap import color_range, colorize
 from gift_peft.files import write_whole
+from gift_peft.images import list_images, read_image
+from gift_peft.models.pixels import resolve_size, to_pixel_values
 
 
 class LoadedModel(NamedTuple):
@@ -94,7 +94,8 @@ def load_model(
         ValueError: the adapter was made for another base, or no size is known.
     """
     from gift_peft.adapter_folder import read_gift
-    from gift_peft.adapters import get_recipe, set_adapter_scale
+    from gift_peft.adapter_scale import set_adapter_scale
+    from gift_peft.adapters import get_recipe
     from gift_peft.models.external import load_external, split_external
 
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -225,25 +226,6 @@ def _at_image_size(depth: torch.Tensor, image: Image.Image, file: Path) -> np.nd
         raise ValueError(f"{file}: the prediction has NaN or infinite values")
     size = (image.height, image.width)
     return torch.nn.functional.interpolate(depth[None], size=size, mode="bicubic", align_corners=False)[0, 0].numpy()
-
-
-def list_images(images: Sequence[str | Path]) -> list[Path]:
-    """Picture files, and those of the folders named; FileNotFoundError or ValueError where there are none."""
-    files: list[Path] = []
-    for path in map(Path, images):
-        files += _pictures_in(path) if path.is_dir() else [path]
-    missing = [str(path) for path in files if not path.is_file()]
-    if missing:
-        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
-        raise FileNotFoundError(f"no such image: {missing[0]}{more}")
-    if not files:
-        listed = ", ".join(map(str, images)) or "an empty list"
-        raise ValueError(f"no images in {listed} (folders within folders are not searched)")
-    return files
-
-
-def _pictures_in(folder: Path) -> list[Path]:
-    return sorted(filter(is_image_file, folder.iterdir()), key=lambda path: natural_key(path.name))
 
 
 def _unique_names(files: Sequence[Path], beside: bool) -> list[str]:

@@ -12,7 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from gift_peft.data.booster import CAMERA, BoosterScene
-from gift_peft.data.preprocess import open_image
+from gift_peft.images import open_image
 
 SUFFIXES = (".npy", ".npz", ".pfm", ".png")
 

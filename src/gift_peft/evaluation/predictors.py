@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-from gift_peft.data.preprocess import resolve_size
 from gift_peft.evaluation.predict import load_model, predict_depth
 from gift_peft.evaluation.protocols import Protocol
+from gift_peft.models.pixels import resolve_size
 
 Predictor = Callable[[torch.Tensor], torch.Tensor]
 METRIC_MODELS = {"zoedepth", "depth_pro", "prompt_depth_anything"}  # they predict metres without saying so

@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 import torch
 
-from gift_peft.data.preprocess import Group, to_mask
+from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.alignment import align, known, to_numpy
 from gift_peft.evaluation.fitting import DegenerateFitError
 from gift_peft.evaluation.metrics import METRICS, depth_metrics
 from gift_peft.evaluation.predictors import Predictor
 from gift_peft.evaluation.protocols import Protocol
 from gift_peft.evaluation.results import REGIONS
+from gift_peft.images import to_mask
 from gift_peft.losses import GeometryConsistencyError, prediction_spread, require_finite
 
 NO_PROXY, NO_DEPTH = "without a treated reference", "without true depth"  # why a row is skipped

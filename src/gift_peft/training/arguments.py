@@ -14,7 +14,7 @@ from typing import Literal, get_origin
 
 import yaml
 
-from gift_peft.data.preprocess import parse_size
+from gift_peft.models.pixels import parse_size
 
 # What a run may be resumed with when it differs: everything else changes the weights that come out.
 FREE_TO_CHANGE = {

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gift_peft.data.cache import GroupCache
-from gift_peft.data.preprocess import Group
+from gift_peft.dataset.tensors import Group
 
 
 def epoch_order(num_groups: int, seed: int, epoch: int) -> list[int]:

@@ -20,7 +20,7 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 if TYPE_CHECKING:
-    from gift_peft.data.preprocess import Group
+    from gift_peft.dataset.tensors import Group
     from gift_peft.group_step import GroupStep, GroupStepOutput
     from gift_peft.training.loop import Run
 

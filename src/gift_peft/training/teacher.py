@@ -14,7 +14,6 @@ from accelerate.utils import gather_object, parse_flag_from_env
 from tqdm import tqdm
 
 from gift_peft.data.gift_i import gift_i_splits, load_gift_i, proxies_command
-from gift_peft.data.preprocess import pixel_settings, resolve_size, to_pixel_values
 from gift_peft.data.proxies import (
     default_proxies_dir,
     difference,
@@ -26,6 +25,7 @@ from gift_peft.data.proxies import (
     write_proxies,
 )
 from gift_peft.evaluation.predict import load_base, predict_depth
+from gift_peft.models.pixels import pixel_settings, resolve_size, to_pixel_values
 
 if TYPE_CHECKING:
     from accelerate import Accelerator

@@ -3,7 +3,7 @@
 `RAW[/train|/validation]/<group>/` holds the observations, in folders of their own if need be, their masks in any form
 that `masks.py` reads, perhaps the treated reference (`reference.*`, `ref.*`, `ref_*`) and `group.yaml` (`surface`,
 `notes`, `mask_class`, `static_rig`). Without split folders, groups with a reference are validation and the others
-train. `GiftI` reads it as it is; `captures.py` makes a prepared folder of it.
+train. `GiftI` reads it as it is; `gift-peft prepare` makes a prepared folder of it.
 """
 
 import io
@@ -17,29 +17,15 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from gift_peft.data.masks import MaskSource, find_mask, is_mask_file
-from gift_peft.data.preprocess import SURFACES, check_group, image_digest, is_image_file, read_image
+from gift_peft.captures.masks import MaskSource, find_mask, is_mask_file
+from gift_peft.images import image_digest, is_image_file, natural_key, read_image
+from gift_peft.rules import SPLITS, SURFACES, check_count, check_group
 
 logger = logging.getLogger(__name__)
 
-SPLITS = ("train", "validation")
 GROUP_KEYS = {"surface", "notes", "mask_class", "static_rig"}
 NOT_PHOTOS = {"valids", "depths", "proxies", "masks_proposed"}  # folders of a group that hold something else
 REFERENCE = re.compile(r"ref(erence)?([^a-z].*)?", re.IGNORECASE)  # but not reflection_1
-
-
-def natural_key(name: str) -> list:
-    """Sorts image_2 before image_10."""
-    return [
-        (0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.split(r"(\d+)", name) if part
-    ]
-
-
-def check_count(group_id: str, count: int, split: str, has_reference: bool) -> None:
-    """A group takes two observations to compare; in validation one will do if there is a treated reference."""
-    if count < (1 if split == "validation" and has_reference else 2):
-        hint = "" if split == "train" else ", or one and a treated reference"
-        raise ValueError(f"group {group_id} has {count} different image{'s' * (count != 1)}; it takes two{hint}")
 
 
 @dataclass

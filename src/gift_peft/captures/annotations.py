@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from gift_peft.data.preprocess import is_image_file, open_image
+from gift_peft.images import is_image_file, open_image
 
 MaskClass = int | str | Sequence[int | str] | None
 

@@ -30,9 +30,10 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from gift_peft.data.masks import MaskSource
-from gift_peft.data.preprocess import is_image_file
-from gift_peft.data.raw import SPLITS, Capture, natural_key
+from gift_peft.captures.masks import MaskSource
+from gift_peft.captures.tree import Capture
+from gift_peft.images import is_image_file, natural_key
+from gift_peft.rules import SPLITS
 
 COLUMNS = ("image", "mask", "proxy", "reference")
 

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
-from gift_peft.data.annotations import (
+from gift_peft.captures.annotations import (
     MaskClass,
     check_size,
     choose_labels,
@@ -31,7 +31,7 @@ from gift_peft.data.annotations import (
     relative_name,
     split_classes,
 )
-from gift_peft.data.preprocess import SINGLE_CHANNEL, is_image_file, open_image, to_mask
+from gift_peft.images import SINGLE_CHANNEL, is_image_file, open_image, to_mask
 
 MASK_FOLDERS = ("masks", "annotations", "SegmentationClass", "SegmentationObject", "masks_proposed")
 UPLOAD_PREFIX = re.compile(r"^[0-9a-f]{8}-")  # Label Studio puts it before the names of uploaded files

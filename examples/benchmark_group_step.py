@@ -35,7 +35,7 @@ from benchmark.models import CONFIGS, PAPER_MINUTES, Config
 from benchmark.report import METHODS, machine, to_markdown
 from PIL import Image
 
-from gift_peft.adapters import get_gift_model
+from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.data.gift_i import load_gift_i
 from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.predict import load_base

@@ -4,7 +4,7 @@ import torch
 from tiny import tiny_model
 from torch import nn
 
-from gift_peft.adapters import get_gift_model
+from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import gift_loss
 

@@ -15,9 +15,9 @@ from test_adapters import PIXELS, depth, load_base, trained
 from tiny import tiny_model, tiny_processor
 from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
-from gift_peft.adapter_folder import save_adapter
-from gift_peft.adapter_scale import set_adapter_scale
-from gift_peft.adapters import HEADS, get_gift_model
+from gift_peft.adapters.folder import save_adapter
+from gift_peft.adapters.recipes import HEADS, get_gift_model
+from gift_peft.adapters.scale import set_adapter_scale
 
 LOCAL_BASE = "ignore:the base is the local folder:UserWarning"
 

@@ -6,8 +6,8 @@ from peft import LoraConfig, get_peft_model
 from test_adapters import PIXELS, depth, trained
 from tiny import tiny_model
 
-from gift_peft.adapter_scale import set_adapter_scale
-from gift_peft.adapters import HEADS, get_gift_model
+from gift_peft.adapters.recipes import HEADS, get_gift_model
+from gift_peft.adapters.scale import set_adapter_scale
 
 
 @pytest.mark.parametrize("head", HEADS)

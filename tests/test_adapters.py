@@ -19,9 +19,9 @@ from transformers import (
     ZoeDepthForDepthEstimation,
 )
 
-from gift_peft.adapter_folder import save_adapter
-from gift_peft.adapter_scale import check_lora_config, set_adapter_scale
-from gift_peft.adapters import RECIPES, GiftRecipe, get_gift_model, get_recipe
+from gift_peft.adapters.folder import save_adapter
+from gift_peft.adapters.recipes import RECIPES, GiftRecipe, get_gift_model, get_recipe
+from gift_peft.adapters.scale import check_lora_config, set_adapter_scale
 from gift_peft.group_step import GroupStep
 
 PIXELS = torch.randn(2, 3, 56, 70, generator=torch.Generator().manual_seed(0))

@@ -8,7 +8,7 @@ import torch
 from accelerate import debug_launcher
 from tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
 
-from gift_peft.adapters import get_gift_model
+from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.data.gift_i import load_gift_i
 from gift_peft.evaluation.evaluate import evaluate_gift_i, run_evaluation
 from gift_peft.evaluation.results import GiftIReport
@@ -72,7 +72,7 @@ def test_the_train_split_has_gce_and_no_accuracy(raw_tree, adapter_model):
 
 
 def test_run_evaluation_prints_and_writes(raw_tree, base_dir, tmp_path, adapter_model, capsys):
-    from gift_peft.adapter_folder import save_adapter
+    from gift_peft.adapters.folder import save_adapter
 
     adapter = tmp_path / "adapter"
     with pytest.warns(UserWarning, match="local"):

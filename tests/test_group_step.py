@@ -26,7 +26,7 @@ from peft import LoraConfig, get_peft_model
 from tiny import tiny_model
 from torch import nn
 
-from gift_peft.adapters import get_gift_model
+from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.group_step import GroupStep
 from gift_peft.losses import gift_loss
 

@@ -5,7 +5,7 @@ import torch
 from group_tools import SIZE, gift_model, gradients, group, largest_error, step_gradients
 from torch import nn
 
-from gift_peft.adapters import get_gift_model
+from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.memory import graph_bytes
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, encoder_blocks, make_adam, use_channels_last
 

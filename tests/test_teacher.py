@@ -86,7 +86,7 @@ def test_proxies_are_the_models_predictions(raw_tree, base_dir, model):
 
 
 def test_first_distillation_is_exactly_zero(raw_tree, base_dir, model):
-    from gift_peft.adapters import get_gift_model
+    from gift_peft.adapters.recipes import get_gift_model
     from gift_peft.group_step import GroupStep
 
     make_proxies(base_dir, raw_tree, splits=["train"], size=SIZE)
@@ -120,12 +120,12 @@ def loader_rows(loader):
 
 def test_prepared_and_default_size(raw_tree, base_dir, tmp_path, monkeypatch):
     """The recipe's size is the paper's; a generic model takes the processor's."""
-    from gift_peft import adapters
+    from gift_peft.adapters import recipes
 
     group = load_gift_i(raw_tree, "validation")[0]
     record = {"split": "validation", **{key: group[key] for key in ("group_id", "images", "masks", "reference")}}
     folder = write_gift_i([record], tmp_path / "prepared", license="cc0-1.0")
-    monkeypatch.setattr(adapters, "RECIPES", {})
+    monkeypatch.setattr(recipes, "RECIPES", {})
     made = make_proxies(base_dir, folder)
     assert read_header(made / "validation/scene_100.safetensors")["size"] == "56x70"
     plain = datasets.load_dataset(str(folder))  # the proxies beside the groups change nothing for others

@@ -313,7 +313,7 @@ def test_a_dataset_without_train_groups(base_dir, tmp_path):
 
 
 def test_a_model_without_a_recipe_is_told_how_to_spell_one(base_dir, tree, tmp_path, monkeypatch):
-    monkeypatch.setattr("gift_peft.adapters.RECIPES", {})
+    monkeypatch.setattr("gift_peft.adapters.recipes.RECIPES", {})
     with pytest.raises(ValueError, match=r"model_name_or_path: no recipe .*target_modules, modules_to_save and pred"):
         train(arguments(base_dir, tree, tmp_path / "out"))
 

@@ -14,12 +14,12 @@ __version__ = "0.1.0"
 _HOME = {
     "GeometryConsistencyError": "losses",
     "GiftI": "data.gift_i",
-    "GiftRecipe": "adapters",
+    "GiftRecipe": "adapters.recipes",
     "GroupStep": "group_step",
     "Metric3DConfig": "models.metric3d",
     "Metric3DForDepthEstimation": "models.metric3d",
     "PROTOCOLS": "evaluation.protocols",
-    "RECIPES": "adapters",
+    "RECIPES": "adapters.recipes",
     "VggtConfig": "models.vggt",
     "VggtForDepthEstimation": "models.vggt",
     "align": "evaluation.alignment",
@@ -27,14 +27,14 @@ _HOME = {
     "evaluate_booster": "evaluation.booster",
     "evaluate_gift_i": "evaluation.evaluate",
     "geometry_consistency_error": "losses",
-    "get_gift_model": "adapters",
+    "get_gift_model": "adapters.recipes",
     "gift_loss": "losses",
     "group_consistency_loss": "losses",
     "load_gift_i": "data.gift_i",
     "masked_l1": "losses",
-    "save_adapter": "adapters",
+    "save_adapter": "adapters.folder",
     "self_distillation_loss": "losses",
-    "set_adapter_scale": "adapters",
+    "set_adapter_scale": "adapters.scale",
 }
 
 __all__ = ["__version__", *sorted(_HOME)]

@@ -1,8 +1,8 @@
 """The memory of a group step: how many images' graphs it keeps (`retain="auto"`), and frozen weights cast once.
 
-Graphs: the first micro-batch shows what the graph of one image takes, the memory that is then free how many fit. On CUDA all
-that is free less a margin, halved whenever it proves too much; on CPU half of what is available, because there a
-process that takes too much is killed, not told.
+Graphs: the first micro-batch shows what the graph of one image takes, the memory that is then free how many fit. On
+CUDA all that is free less a margin, halved whenever it proves too much; on CPU half of what is available, because
+there a process that takes too much is killed, not told.
 
 Casts: autocast casts every weight again in each forward, and a graph that is retained keeps its casts: of Depth
 Anything V2-Large, 0.6 GB for each micro-batch. Its own cache holds weights that are trained only. `cast_frozen_once`

@@ -93,9 +93,9 @@ def load_model(
         FileNotFoundError: no model or adapter at that place.
         ValueError: the adapter was made for another base, or no size is known.
     """
-    from gift_peft.adapter_folder import read_gift
-    from gift_peft.adapter_scale import set_adapter_scale
-    from gift_peft.adapters import get_recipe
+    from gift_peft.adapters.folder import read_gift
+    from gift_peft.adapters.recipes import get_recipe
+    from gift_peft.adapters.scale import set_adapter_scale
     from gift_peft.models.external import load_external, split_external
 
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -145,7 +145,7 @@ def predict_depth(model: Any, pixel_values: torch.Tensor, batch_size: int = 2) -
 
 def prediction_kind(model: Any) -> str:
     """`depth` or `inverse_depth`, as the model's recipe says; ValueError where there is none to ask."""
-    from gift_peft.adapters import get_recipe
+    from gift_peft.adapters.recipes import get_recipe
 
     config = getattr(model, "config", None)
     if config is None:
@@ -251,7 +251,7 @@ def _attach(model, processor, base, adapter, revision):
     from safetensors import SafetensorError
     from transformers import AutoImageProcessor
 
-    from gift_peft.adapter_folder import ADAPTER_WEIGHTS, PROCESSOR_CONFIG, read_adapter_config
+    from gift_peft.adapters.folder import ADAPTER_WEIGHTS, PROCESSOR_CONFIG, read_adapter_config
 
     made_for = read_adapter_config(adapter).base_model_name_or_path
     _check_base(base, revision, adapter, made_for)
@@ -282,7 +282,7 @@ def _check_base(base, revision, adapter, made_for: str | None) -> None:
     hub ids by name. A folder here for a hub id there, or the
     other way round, may be a copy: then shapes alone decide.
     """
-    from gift_peft.adapter_folder import read_gift
+    from gift_peft.adapters.folder import read_gift
 
     trained, present = read_gift(adapter).get("base_revision") or "", teacher_revision(base, revision)
     if not trained and made_for and (Path(made_for) / "config.json").is_file():

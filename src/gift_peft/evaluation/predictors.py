@@ -74,7 +74,7 @@ def network_size(size: tuple[int, int] | None, model: Any, processor: Any) -> tu
 
 
 def _recipe(model):
-    from gift_peft.adapters import get_recipe
+    from gift_peft.adapters.recipes import get_recipe
 
     try:
         return get_recipe(model)

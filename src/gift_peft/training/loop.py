@@ -17,8 +17,8 @@ import torch
 from accelerate import Accelerator
 from accelerate.utils import broadcast_object_list, set_seed
 
-from gift_peft.adapter_folder import save_adapter
-from gift_peft.adapters import GiftRecipe, get_gift_model, get_recipe
+from gift_peft.adapters.folder import save_adapter
+from gift_peft.adapters.recipes import GiftRecipe, get_gift_model, get_recipe
 from gift_peft.data.booster import find_booster
 from gift_peft.data.cache import default_cache_dir
 from gift_peft.data.gift_i import dataset_fingerprint, gift_i_splits, load_gift_i, proxies_command

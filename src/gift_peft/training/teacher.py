@@ -67,7 +67,7 @@ def make_proxies(
         ValueError, OSError: in every process, one line naming the file, or group and image: stale proxies, NaN
             predictions, unreadable data, a folder that cannot be written.
     """
-    from gift_peft.adapters import RECIPES
+    from gift_peft.adapters.recipes import RECIPES
 
     state = accelerator or PartialState(cpu=parse_flag_from_env("ACCELERATE_USE_CPU"))
     identity = teacher_id(base, revision)

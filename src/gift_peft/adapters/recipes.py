@@ -16,19 +16,8 @@ import torch
 from peft import LoraConfig, PeftModel, get_peft_model
 from torch import nn
 
-from gift_peft.adapter_folder import save_adapter
-from gift_peft.adapter_scale import check_lora_config, set_adapter_scale
+from gift_peft.adapters.scale import check_lora_config
 from gift_peft.group_step import dropout_rates
-
-__all__ = [
-    "RECIPES",
-    "GiftRecipe",
-    "check_lora_config",
-    "get_gift_model",
-    "get_recipe",
-    "save_adapter",
-    "set_adapter_scale",
-]
 
 HEADS = ("full", "lora", "none")
 KINDS = ("depth", "inverse_depth")

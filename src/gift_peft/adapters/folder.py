@@ -18,7 +18,7 @@ from typing import Any
 from peft import LoraConfig, PeftConfig, PeftModel
 from peft.tuners.lora import LoraLayer
 
-from gift_peft.adapter_scale import active_lora, active_saved_modules
+from gift_peft.adapters.scale import active_lora, active_saved_modules
 from gift_peft.files import jsonable
 
 ADAPTER_CONFIG = "adapter_config.json"

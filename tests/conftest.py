@@ -14,8 +14,8 @@ from records import records
 from runs import arguments
 from tiny import tiny_model, write_base, write_raw_tree
 
-from gift_peft.data.gift_i import register
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.gift_i import register
+from gift_peft.dataset.writer import write_gift_i
 from gift_peft.training import train
 
 torch.set_num_threads(1)

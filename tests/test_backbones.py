@@ -11,7 +11,7 @@ from tiny import tiny_model, tiny_processor, write_raw_tree
 from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
 from gift_peft import set_adapter_scale
-from gift_peft.data.gift_i import load_gift_i
+from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.models.metric3d import Metric3DImageProcessorPil
 from gift_peft.models.pixels import to_pixel_values

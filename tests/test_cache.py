@@ -10,10 +10,10 @@ import torch
 from PIL import Image
 from tiny import SIZE, tiny_processor, write_group
 
-from gift_peft.data import cache as module
-from gift_peft.data import rows as rows_module
-from gift_peft.data.cache import GroupCache
-from gift_peft.data.gift_i import load_gift_i
+from gift_peft.dataset import cache as module
+from gift_peft.dataset import rows as rows_module
+from gift_peft.dataset.cache import GroupCache
+from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.training.teacher import make_proxies
 

@@ -16,10 +16,10 @@ from PIL import Image
 
 from gift_peft.cli import main
 from gift_peft.data.captures import prepare
-from gift_peft.data.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.data.matching import RegistrationSettings
 from gift_peft.data.prepare_arguments import PrepareSettings, parse_arguments
 from gift_peft.data.quality import QualitySettings
+from gift_peft.dataset.gift_i import dataset_fingerprint, load_gift_i
 
 SIZE = (160, 200)
 

@@ -22,7 +22,7 @@ from gift_peft import (
     VggtForDepthEstimation,
     get_gift_model,
 )
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.writer import write_gift_i
 from gift_peft.evaluation import cards
 from gift_peft.evaluation.bases import adapter_sizes, find_base
 from gift_peft.evaluation.card_metadata import base_license, is_local, portable_name

@@ -12,7 +12,7 @@ from tiny import write_base
 from transformers import AutoModelForDepthEstimation
 
 from gift_peft import load_gift_i
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.writer import write_gift_i
 from gift_peft.demo import run
 
 KINDS = ("mirror", "pane", "solid")

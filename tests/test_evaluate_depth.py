@@ -9,8 +9,8 @@ from booster_tree import bilinear
 from PIL import Image
 from tiny import SIZE, tiny_model, tiny_processor
 
-from gift_peft.data.gift_i import load_gift_i
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.dataset.writer import write_gift_i
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.panels import group_panels
 from gift_peft.evaluation.results import REGIONS

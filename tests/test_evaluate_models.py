@@ -9,7 +9,7 @@ from accelerate import debug_launcher
 from tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
 
 from gift_peft.adapters.recipes import get_gift_model
-from gift_peft.data.gift_i import load_gift_i
+from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.evaluation.evaluate import evaluate_gift_i, run_evaluation
 from gift_peft.evaluation.results import GiftIReport
 from gift_peft.training.teacher import make_proxies

@@ -11,10 +11,10 @@ from PIL import Image
 from tiny import write_group, write_raw_tree
 
 from gift_peft.cli import main
-from gift_peft.data.export import export_parquet
-from gift_peft.data.gift_i import FEATURES, load_gift_i
-from gift_peft.data.rows import IMAGE_COLUMNS
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.export import export_parquet
+from gift_peft.dataset.gift_i import FEATURES, load_gift_i
+from gift_peft.dataset.rows import IMAGE_COLUMNS
+from gift_peft.dataset.writer import write_gift_i
 
 
 def prepared(tmp_path, counts=(2, 3), size=(60, 80)):

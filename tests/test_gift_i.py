@@ -17,9 +17,9 @@ from records import one_line, records, save_mask
 from tiny import SIZE, tiny_processor, write_group, write_raw_tree
 from torch.utils.data import DataLoader
 
-from gift_peft.data.gift_i import FEATURES, GiftI, dataset_fingerprint, gift_i_splits, load_gift_i
-from gift_peft.data.writer import SCHEMA, write_gift_i
+from gift_peft.dataset.gift_i import FEATURES, GiftI, dataset_fingerprint, gift_i_splits, load_gift_i
 from gift_peft.dataset.tensors import collate_group
+from gift_peft.dataset.writer import SCHEMA, write_gift_i
 
 CLEARGRASP = os.path.join(os.path.dirname(__file__), "..", "..", "shared", "data", "cleargrasp_d435")
 

@@ -11,8 +11,8 @@ from PIL import Image
 from records import one_line, records, save_mask
 from tiny import write_group
 
-from gift_peft.data.gift_i import GiftI, load_gift_i
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.gift_i import GiftI, load_gift_i
+from gift_peft.dataset.writer import write_gift_i
 
 pytestmark = pytest.mark.usefixtures("fresh_cache")
 

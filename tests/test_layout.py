@@ -9,9 +9,9 @@ from PIL import Image
 
 from gift_peft.captures.foreign import read_layout
 from gift_peft.data.captures import prepare
-from gift_peft.data.gift_i import load_gift_i
 from gift_peft.data.prepare_arguments import PrepareSettings
 from gift_peft.data.registration import warp
+from gift_peft.dataset.gift_i import load_gift_i
 
 SIZE = (160, 200)
 FOLDERS = """

@@ -13,9 +13,10 @@ from PIL import Image
 from records import one_line
 from tiny import SIZE, tiny_model, tiny_processor, write_base
 
-from gift_peft.data.gift_i import load_gift_i
-from gift_peft.data.proxies import default_proxies_dir, read_header, teacher_id, teacher_revision, write_proxies
+from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.dataset.proxies import default_proxies_dir, read_header, write_proxies
 from gift_peft.dataset.tensors import collate_group
+from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.training import teacher
 from gift_peft.training.teacher import make_proxies
 
@@ -261,7 +262,7 @@ def test_two_runs_may_make_the_same_proxies(tmp_path, monkeypatch):
         os.unlink(source)
         raise FileNotFoundError(source)
 
-    monkeypatch.setattr("gift_peft.data.proxies.os.replace", taken_away)
+    monkeypatch.setattr("gift_peft.dataset.proxies.os.replace", taken_away)
     write_proxies(tmp_path / "a.safetensors", header, proxies, None)  # the other run's file is the same
     with pytest.raises(FileNotFoundError):
         write_proxies(tmp_path / "new.safetensors", header, proxies, None)

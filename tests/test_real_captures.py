@@ -11,7 +11,7 @@ from PIL import Image
 from test_captures import statuses
 
 from gift_peft.data.captures import prepare
-from gift_peft.data.gift_i import load_gift_i
+from gift_peft.dataset.gift_i import load_gift_i
 
 SHARED = os.path.join(os.path.dirname(__file__), "..", "..", "shared", "data")
 

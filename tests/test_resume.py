@@ -15,8 +15,8 @@ from accelerate.state import AcceleratorState
 from runs import arguments, assert_same_run, run_in_child, train_again, weights
 
 from gift_peft import cli
-from gift_peft.data.gift_i import dataset_fingerprint, load_gift_i
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.gift_i import dataset_fingerprint, load_gift_i
+from gift_peft.dataset.writer import write_gift_i
 from gift_peft.group_step import GroupStep
 from gift_peft.training import checkpoints, loop, train, validation
 

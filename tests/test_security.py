@@ -22,8 +22,8 @@ from tiny import SIZE, tiny_processor, write_raw_tree
 
 from gift_peft.adapters.folder import read_adapter_config, read_gift, save_adapter
 from gift_peft.adapters.recipes import get_gift_model
-from gift_peft.data.gift_i import FEATURES, gift_i_splits, load_gift_i
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.gift_i import FEATURES, gift_i_splits, load_gift_i
+from gift_peft.dataset.writer import write_gift_i
 from gift_peft.evaluation.predict import load_base, load_model
 from gift_peft.images import open_image, read_image
 from gift_peft.models.pixels import resolve_size

@@ -14,11 +14,12 @@ from PIL import Image
 from tiny import SIZE, tiny_processor, write_raw_tree
 from torch.utils.data import DataLoader
 
-from gift_peft.data.gift_i import load_gift_i
-from gift_peft.data.proxies import read_header, teacher_id
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.dataset.proxies import read_header
 from gift_peft.dataset.tensors import collate_group
+from gift_peft.dataset.writer import write_gift_i
 from gift_peft.evaluation.predict import predict_depth
+from gift_peft.models.identity import teacher_id
 from gift_peft.models.pixels import to_pixel_values
 from gift_peft.training import teacher
 from gift_peft.training.teacher import make_proxies

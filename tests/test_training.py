@@ -15,11 +15,11 @@ from tiny import SIZE, tiny_processor, write_group, write_raw_tree
 from transformers import AutoModelForDepthEstimation
 
 from gift_peft import evaluate_booster
-from gift_peft.data.gift_i import load_gift_i
+from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.dataset.loader import PreparedGroups, epoch_order
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.losses import geometry_consistency_error
 from gift_peft.training import checkpoints, loop, start, train
-from gift_peft.training.groups import PreparedGroups, epoch_order
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
 pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")

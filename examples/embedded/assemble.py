@@ -11,7 +11,7 @@ import json
 import shutil
 from pathlib import Path
 
-from gift_peft.data.writer import write_gift_i
+from gift_peft.dataset.writer import write_gift_i
 
 DEMO = Path(__file__).resolve().parents[2] / "src" / "gift_peft" / "demo"
 DESCRIPTION = """Rendered rooms (Mitsuba 3) for trying GIFT without a camera: mirrors on walls and standing, glass

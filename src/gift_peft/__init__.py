@@ -6,14 +6,14 @@ VGGT and Metric3D V2. The names below are imported when first used, so that `gif
 
 from importlib import import_module
 
-from gift_peft.data.gift_i import register
+from gift_peft.dataset.gift_i import register
 from gift_peft.models import register_models
 
 __version__ = "0.1.0"
 
 _HOME = {
     "GeometryConsistencyError": "losses",
-    "GiftI": "data.gift_i",
+    "GiftI": "dataset.gift_i",
     "GiftRecipe": "adapters.recipes",
     "GroupStep": "group_step",
     "Metric3DConfig": "models.metric3d",
@@ -30,7 +30,7 @@ _HOME = {
     "get_gift_model": "adapters.recipes",
     "gift_loss": "losses",
     "group_consistency_loss": "losses",
-    "load_gift_i": "data.gift_i",
+    "load_gift_i": "dataset.gift_i",
     "masked_l1": "losses",
     "save_adapter": "adapters.folder",
     "self_distillation_loss": "losses",

@@ -189,7 +189,7 @@ def _prepare(args: argparse.Namespace, rest: list[str]) -> int:
 
 
 def _export(args: argparse.Namespace, rest: list[str]) -> int:
-    from gift_peft.data.export import export_parquet
+    from gift_peft.dataset.export import export_parquet
 
     folder = export_parquet(args.dataset, args.folder, args.max_shard_size, args.license)
     print(f"Dataset: {folder}")

@@ -14,7 +14,7 @@ from gift_peft.data.capture_job import Job, Outcome, capture_digest
 from gift_peft.data.matching import Frame
 from gift_peft.data.quality import Small, check_frames, check_group_change, pairwise_changes
 from gift_peft.data.registration import Registration, reason, register, valid_area, warp, warp_stored
-from gift_peft.data.writer import write_group
+from gift_peft.dataset.writer import write_group
 from gift_peft.rules import check_count, check_group_id
 
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything

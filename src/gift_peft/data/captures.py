@@ -74,7 +74,7 @@ from gift_peft.captures.tree import find_groups
 from gift_peft.data.capture_group import prepare_group
 from gift_peft.data.capture_job import FORMAT, Job, Outcome
 from gift_peft.data.prepare_arguments import PrepareSettings
-from gift_peft.data.writer import write_card, write_rows
+from gift_peft.dataset.writer import write_card, write_rows
 from gift_peft.files import write_whole
 from gift_peft.rules import SPLITS
 

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from importlib.resources import as_file, files
 from pathlib import Path
 
-from gift_peft.data.gift_i import load_gift_i
+from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.evaluation.cards import run_length
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.figures import before_after

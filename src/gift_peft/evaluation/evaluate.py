@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from gift_peft.data.booster import find_booster
-from gift_peft.data.gift_i import load_gift_i
+from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.tensors import Group, collate_group
 from gift_peft.evaluation.booster import evaluate_booster
 from gift_peft.evaluation.predict import load_model, prediction_kind

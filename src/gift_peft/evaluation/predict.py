@@ -18,10 +18,10 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.data.proxies import check_base_name, teacher_revision
 from gift_peft.evaluation.colormap import color_range, colorize
 from gift_peft.files import write_whole
 from gift_peft.images import list_images, read_image
+from gift_peft.models.identity import check_base_name, teacher_revision
 from gift_peft.models.pixels import resolve_size, to_pixel_values
 
 

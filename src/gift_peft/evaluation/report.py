@@ -344,7 +344,7 @@ def _label(group_id: str, image: str, notable: dict) -> str:
 
 def _group_rows(report: AnyReport) -> Callable[[str], dict]:
     """From a group's id to its row of the dataset."""
-    from gift_peft.data.gift_i import load_gift_i
+    from gift_peft.dataset.gift_i import load_gift_i
 
     about = report.about
     rows = load_gift_i(

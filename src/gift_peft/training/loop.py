@@ -20,9 +20,9 @@ from accelerate.utils import broadcast_object_list, set_seed
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import GiftRecipe, get_gift_model, get_recipe
 from gift_peft.data.booster import find_booster
-from gift_peft.data.cache import default_cache_dir
-from gift_peft.data.gift_i import dataset_fingerprint, gift_i_splits, load_gift_i, proxies_command
-from gift_peft.data.proxies import teacher_revision
+from gift_peft.dataset.cache import default_cache_dir
+from gift_peft.dataset.gift_i import dataset_fingerprint, gift_i_splits, load_gift_i, proxies_command
+from gift_peft.dataset.loader import PreparedGroups, epoch_order
 from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.cards import model_card
 from gift_peft.evaluation.layout import number
@@ -30,10 +30,10 @@ from gift_peft.evaluation.predict import load_base
 from gift_peft.evaluation.tables import relative_change
 from gift_peft.files import jsonable
 from gift_peft.group_step import GroupStep
+from gift_peft.models.identity import teacher_revision
 from gift_peft.models.pixels import resolve_size
 from gift_peft.training import card, checkpoints, validation
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
-from gift_peft.training.groups import PreparedGroups, epoch_order
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last

@@ -13,24 +13,21 @@ from accelerate import PartialState
 from accelerate.utils import gather_object, parse_flag_from_env
 from tqdm import tqdm
 
-from gift_peft.data.gift_i import gift_i_splits, load_gift_i, proxies_command
-from gift_peft.data.proxies import (
+from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
+from gift_peft.dataset.proxies import (
     default_proxies_dir,
     difference,
     make_header,
     read_header,
     row_digests,
-    teacher_id,
-    teacher_revision,
     write_proxies,
 )
 from gift_peft.evaluation.predict import load_base, predict_depth
+from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.models.pixels import pixel_settings, resolve_size, to_pixel_values
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
-
-__all__ = ["make_proxies", "teacher_id", "teacher_revision"]
 
 
 def make_proxies(

@@ -19,7 +19,7 @@ import safetensors
 import safetensors.numpy
 import safetensors.torch
 
-from gift_peft.data.proxies import METADATA, row_digests
+from gift_peft.dataset.proxies import METADATA, row_digests
 from gift_peft.dataset.tensors import Group, resize_row, to_group
 from gift_peft.files import write_whole
 from gift_peft.models.pixels import pixel_settings

@@ -20,8 +20,8 @@ from datasets.table import embed_table_storage
 from huggingface_hub import DatasetCard
 from tqdm import tqdm
 
-from gift_peft.data.gift_i import FEATURES, gift_i_splits, load_gift_i
-from gift_peft.data.writer import CARD
+from gift_peft.dataset.gift_i import FEATURES, gift_i_splits, load_gift_i
+from gift_peft.dataset.writer import CARD
 
 # The pictures are compressed already; chunking by content lets a changed dataset upload only what changed.
 OPTIONS = {"compression": "none", "use_content_defined_chunking": True, "write_page_index": True}

@@ -26,9 +26,10 @@ from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
 from gift_peft.captures.tree import list_groups, raw_example
-from gift_peft.data.proxies import FORMAT, ProxyStore, default_proxies_dir, teacher_id, teacher_revision
-from gift_peft.data.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
+from gift_peft.dataset.proxies import FORMAT, ProxyStore, default_proxies_dir
+from gift_peft.dataset.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
 from gift_peft.images import image_digest, natural_key, to_mask
+from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
 
 FEATURES = Features(

@@ -13,7 +13,7 @@ from datasets import formatting
 from datasets.formatting.formatting import Formatter
 from PIL import Image
 
-from gift_peft.data.proxies import ProxyStore
+from gift_peft.dataset.proxies import ProxyStore
 from gift_peft.images import open_image, to_mask, to_rgb
 from gift_peft.rules import check_group, label_items
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gift_peft.data.cache import GroupCache
+from gift_peft.dataset.cache import GroupCache
 from gift_peft.dataset.tensors import Group
 
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from gift_peft.data.captures import prepare
+from gift_peft.prepare.prepare import prepare_gift_i
 
 
 def write_group(folder: Path, seed: int, frames: int, size=(720, 1280)) -> None:
@@ -61,7 +61,7 @@ def main() -> None:
         walls = []
         for processes in (1, 2):
             wall, used = time.perf_counter(), processor_seconds()
-            report = prepare(Path(place) / "raw", Path(place) / f"out_{processes}", num_proc=processes)
+            report = prepare_gift_i(Path(place) / "raw", Path(place) / f"out_{processes}", num_proc=processes)
             wall, used = time.perf_counter() - wall, processor_seconds() - used
             walls.append(wall)
             frames, found = args.groups * args.frames, report["statistics"]["train"]

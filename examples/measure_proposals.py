@@ -11,7 +11,7 @@ import argparse
 import numpy as np
 
 import gift_peft
-from gift_peft.data.proposals import propose
+from gift_peft.prepare.proposals import propose
 
 
 def measure(dataset: str, split: str, reference: bool = False) -> list[tuple[str, float, float]]:

@@ -16,7 +16,7 @@ from photos import capture, scene
 from PIL import Image
 
 from gift_peft.cli import main
-from gift_peft.data.captures import prepare
+from gift_peft.prepare.prepare import prepare_gift_i
 
 SIZE = (120, 160)
 
@@ -257,7 +257,7 @@ def test_without_permission(tmp_path):
         if uid == 0:
             os.seteuid(65534)
         try:
-            report = prepare(place / "raw", place / "out")
+            report = prepare_gift_i(place / "raw", place / "out")
         finally:
             os.seteuid(uid)
         entries = {entry["group_id"]: entry for entry in report["groups"]}
@@ -266,7 +266,7 @@ def test_without_permission(tmp_path):
             assert "Permission denied" in entries[name]["reasons"][0]["text"], entries[name]["reasons"]
         for name in ("image/1.png", "mask/masks/0.png", "folder"):
             (place / "raw/train" / name).chmod(0o755)
-        report = prepare(place / "raw", place / "out")  # what failed for a passing reason is tried again
+        report = prepare_gift_i(place / "raw", place / "out")  # what failed for a passing reason is tried again
         assert {entry["status"] for entry in report["groups"]} == {"kept"}
     finally:
         rmtree(place)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gift_peft.data.capture_report import write_html
+from gift_peft.prepare.page import write_html
 
 SIZE = (160, 120)
 

@@ -15,11 +15,11 @@ from photos import capture, motion, moved, scene, target, with_content, write_ca
 from PIL import Image
 
 from gift_peft.cli import main
-from gift_peft.data.captures import prepare
-from gift_peft.data.matching import RegistrationSettings
-from gift_peft.data.prepare_arguments import PrepareSettings, parse_arguments
-from gift_peft.data.quality import QualitySettings
 from gift_peft.dataset.gift_i import dataset_fingerprint, load_gift_i
+from gift_peft.prepare.matching import RegistrationSettings
+from gift_peft.prepare.prepare import prepare_gift_i
+from gift_peft.prepare.quality import QualitySettings
+from gift_peft.prepare.settings import PrepareSettings, parse_arguments
 
 SIZE = (160, 200)
 
@@ -47,7 +47,7 @@ def made(tmp_path_factory):
     rng = np.random.default_rng(0)
     motions = [motion(rng, SIZE, translation=5, degrees=1), motion(rng, SIZE, translation=5, degrees=1)]
     capture(raw / "moved", 4, count=3, size=SIZE, motions=motions)
-    report = prepare(raw, root / "out")
+    report = prepare_gift_i(raw, root / "out")
     return raw, root / "out", report
 
 
@@ -136,7 +136,7 @@ def test_a_moved_reference_is_warped_and_takes_its_border_from_all(tmp_path):
     treated, _ = moved(treated, np.zeros_like(mask), np.array([[1, 0, 5.0], [0, 1, 3], [0, 0, 1]]), rng, noise=1)
     frames = [with_content(picture, mask, rng, noise=1) for _ in range(2)]
     write_capture(tmp_path / "raw/g", frames, [mask, mask], treated)
-    report = prepare(tmp_path / "raw", tmp_path / "out")
+    report = prepare_gift_i(tmp_path / "raw", tmp_path / "out")
     reference = report["groups"][0]["frames"][-1]
     assert reference["status"] == "warped" and reference["warnings"][-1]["code"] == "reference_moved"
     row = load_gift_i(tmp_path / "out", "validation")[0]
@@ -148,13 +148,13 @@ def test_a_moved_reference_is_warped_and_takes_its_border_from_all(tmp_path):
 def test_a_reference_of_another_place_is_dropped_with_a_warning(tmp_path):
     group = capture(tmp_path / "raw/validation/g", 12, count=2, size=SIZE, reference=True)
     Image.fromarray(scene(99, SIZE)).save(group / "reference.png")
-    report = prepare(tmp_path / "raw", tmp_path / "out")
+    report = prepare_gift_i(tmp_path / "raw", tmp_path / "out")
     found = report["groups"][0]
     assert found["status"] == "kept" and found["frames"][-1]["status"] == "dropped"
     assert "reference_dropped" in [item["code"] for item in found["warnings"]]
     assert load_gift_i(tmp_path / "out", "validation")[0]["reference"] is None
     (group / "1.png").unlink()  # one observation alone needs its reference
-    assert prepare(tmp_path / "raw", tmp_path / "out")["groups"][0]["status"] == "rejected"
+    assert prepare_gift_i(tmp_path / "raw", tmp_path / "out")["groups"][0]["status"] == "rejected"
 
 
 def test_quality_warnings(tmp_path):
@@ -167,12 +167,12 @@ def test_quality_warnings(tmp_path):
     masks = [mask, mask, np.roll(mask, 12, axis=1), mask]
     write_capture(tmp_path / "raw/g", frames, masks)
     (tmp_path / "raw/g/group.yaml").write_text("static_rig: true")
-    frames = prepare(tmp_path / "raw", tmp_path / "out")["groups"][0]["frames"]
+    frames = prepare_gift_i(tmp_path / "raw", tmp_path / "out")["groups"][0]["frames"]
     codes = [{item["code"] for item in frame["warnings"]} for frame in frames]
     assert "blurred" in codes[0] and "near_duplicate" in codes[3] and "mask_disagrees" in codes[2]
     assert all(frame["status"] != "dropped" for frame in frames)
     strict = PrepareSettings(quality=QualitySettings(drop_mask_iou=0.8, drop_sharpness=0.35))
-    frames = prepare(tmp_path / "raw", tmp_path / "out", strict)["groups"][0]["frames"]
+    frames = prepare_gift_i(tmp_path / "raw", tmp_path / "out", strict)["groups"][0]["frames"]
     assert [frame["status"] for frame in frames] == ["dropped", "identity", "dropped", "kept"]
     assert "threshold 0.35" in frames[0]["reasons"][0]["text"]
 
@@ -192,7 +192,7 @@ def copied(made, tmp_path):
 def test_only_what_changed_is_done_again(made, tmp_path):
     raw, out = copied(made, tmp_path)
     before = snapshot(out)
-    report = prepare(raw, out)
+    report = prepare_gift_i(raw, out)
     after = snapshot(out)
     groups = [path for path in before if path.parts[-2] in ("images", "masks", "valids")]
     assert groups and all(before[path] == after[path] for path in groups)
@@ -201,7 +201,7 @@ def test_only_what_changed_is_done_again(made, tmp_path):
     os.utime(raw / "moved/0.png")  # touched, not changed
     Image.fromarray(scene(55, SIZE)).save(raw / "nested photos/day 1/img_9.png")
     (out / entry(report, "treated")["frames"][0]["prepared"]).unlink()  # OUT was tampered with
-    report = prepare(raw, out)
+    report = prepare_gift_i(raw, out)
     assert report["removed"] == ["train/plain"] and not (out / "train/plain").exists()
     assert entry(report, "nested photos")["status"] == "rejected" and not (out / "train/nested photos").exists()
     again = snapshot(out)
@@ -212,10 +212,10 @@ def test_only_what_changed_is_done_again(made, tmp_path):
 
 def test_settings_are_part_of_what_a_group_is_made_from(made, tmp_path):
     raw, out = copied(made, tmp_path)
-    report = prepare(raw, out, PrepareSettings(static_rig=True))
+    report = prepare_gift_i(raw, out, PrepareSettings(static_rig=True))
     assert statuses(report, "moved") != ["warped", "warped", "kept"]
     exact = PrepareSettings(registration=RegistrationSettings(paper_exact=True))
-    report = prepare(raw, out, exact)
+    report = prepare_gift_i(raw, out, exact)
     figures = [
         frame["registration"] for group in report["groups"] for frame in group["frames"] if frame["registration"]
     ]
@@ -226,7 +226,7 @@ def test_settings_are_part_of_what_a_group_is_made_from(made, tmp_path):
 
 def test_processes_make_the_same(made, tmp_path):
     raw, out, report = made
-    again = prepare(raw, tmp_path / "out", num_proc=2)
+    again = prepare_gift_i(raw, tmp_path / "out", num_proc=2)
     assert {**again, "raw": ""} == {**report, "raw": ""}
     for path in out.rglob("*"):
         other = tmp_path / "out" / path.relative_to(out)
@@ -235,7 +235,7 @@ def test_processes_make_the_same(made, tmp_path):
 
 
 def test_killed_at_any_group_nothing_is_half_there(made, tmp_path, monkeypatch):
-    from gift_peft.data import captures
+    from gift_peft.prepare import prepare
 
     raw, _, report = made
 
@@ -245,7 +245,7 @@ def test_killed_at_any_group_nothing_is_half_there(made, tmp_path, monkeypatch):
     for step in ("_install", "_write_record", "_write_rows"):
         for count in (1, 3):
             place, calls = tmp_path / f"{step}{count}", []
-            real = getattr(captures, step)
+            real = getattr(prepare, step)
 
             def dies(*arguments, real=real, calls=calls, count=count):
                 calls.append(None)
@@ -254,14 +254,14 @@ def test_killed_at_any_group_nothing_is_half_there(made, tmp_path, monkeypatch):
                 return real(*arguments)
 
             with monkeypatch.context() as patch:
-                patch.setattr(captures, step, dies)
+                patch.setattr(prepare, step, dies)
                 with pytest.raises(Killed):
-                    prepare(raw, place)
+                    prepare_gift_i(raw, place)
             for split in ("train", "validation"):  # what the tables name is there, whole
                 if (place / split / "metadata.parquet").exists():
                     for row in load_gift_i(place, split):
                         assert row["images"]
-            again = prepare(raw, place)
+            again = prepare_gift_i(raw, place)
             assert {**again, "raw": ""} == {**report, "raw": ""}
             assert not (place / ".prepare/staging").exists()
 
@@ -300,11 +300,11 @@ def test_places_that_are_refused(made, tmp_path):
         ((tmp_path / "full", tmp_path / "new"), "no group folders"),
     ):
         with pytest.raises((ValueError, OSError)) as error:
-            prepare(*arguments)
+            prepare_gift_i(*arguments)
         assert words in str(error.value) and "\n" not in str(error.value)
     assert (tmp_path / "full/holiday.jpg").read_text() == "mine"
     with pytest.raises(ValueError, match="num_proc"):
-        prepare(raw, tmp_path / "new", num_proc=0)
+        prepare_gift_i(raw, tmp_path / "new", num_proc=0)
 
 
 def test_one_run_at_a_time_in_a_folder(made, tmp_path):
@@ -313,10 +313,10 @@ def test_one_run_at_a_time_in_a_folder(made, tmp_path):
     with FileLock(out / ".prepare/lock"):
         before = snapshot(out)
         with pytest.raises(ValueError, match=r"another gift-peft prepare is at work") as error:
-            prepare(raw, out)
+            prepare_gift_i(raw, out)
         assert "\n" not in str(error.value)
         assert {**before, out / ".prepare/lock": None} == {**snapshot(out), out / ".prepare/lock": None}
-    assert prepare(raw, out)["groups"] and (out / "report.json").exists()
+    assert prepare_gift_i(raw, out)["groups"] and (out / "report.json").exists()
 
 
 def test_arguments(tmp_path):
@@ -375,16 +375,16 @@ def test_proposed_masks_are_used_only_when_accepted(tmp_path):
     drawn = np.asarray(Image.open(group / "masks/2.png")) > 0
     shutil.rmtree(group / "masks")
     raw, out = tmp_path / "raw", tmp_path / "out"
-    found = prepare(raw, out)["groups"][0]
+    found = prepare_gift_i(raw, out)["groups"][0]
     assert found["status"] == "rejected" and "missing mask" in found["reasons"][0]["text"]
-    found = prepare(raw, out, PrepareSettings(propose_masks=True))["groups"][0]
+    found = prepare_gift_i(raw, out, PrepareSettings(propose_masks=True))["groups"][0]
     assert found["status"] == "rejected" and found["reasons"][0]["code"] == "masks_proposed"
     assert found["proposal"]["accepted"] is False and len(found["proposal"]["masks"]) == 3
     assert not (out / "train/g").exists() and not (raw / "g/masks_proposed").exists()
     mask = np.asarray(Image.open(out / found["proposal"]["masks"][2])) > 0
     assert (mask & drawn).sum() / (mask | drawn).sum() > 0.6
     settings = PrepareSettings(propose_masks=True, accept_proposed_masks=True)
-    found = prepare(raw, out, settings)["groups"][0]
+    found = prepare_gift_i(raw, out, settings)["groups"][0]
     assert found["status"] == "kept" and found["proposal"]["accepted"] is True
     assert "proposed" in (out / "README.md").read_text()
     row = load_gift_i(out, "train")[0]
@@ -392,6 +392,6 @@ def test_proposed_masks_are_used_only_when_accepted(tmp_path):
     for name in found["proposal"]["masks"]:  # taken over by hand: now they are drawn
         (group / "masks").mkdir(exist_ok=True)
         shutil.copy(out / name, group / "masks")
-    found = prepare(raw, out)["groups"][0]
+    found = prepare_gift_i(raw, out)["groups"][0]
     assert found["status"] == "kept" and found["proposal"] is None
     assert "proposed" not in (out / "README.md").read_text() and not (out / "masks_proposed/train/g").exists()

@@ -8,10 +8,10 @@ from photos import capture, motion
 from PIL import Image
 
 from gift_peft.captures.foreign import read_layout
-from gift_peft.data.captures import prepare
-from gift_peft.data.prepare_arguments import PrepareSettings
-from gift_peft.data.registration import warp
 from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.prepare.prepare import prepare_gift_i
+from gift_peft.prepare.registration import warp
+from gift_peft.prepare.settings import PrepareSettings
 
 SIZE = (160, 200)
 FOLDERS = """
@@ -76,12 +76,12 @@ columns: [image, mask, proxy, reference]
 
 
 def test_folders_and_lists_give_the_same_groups(raw, tmp_path):
-    report = prepare(raw, tmp_path / "folders", settings(tmp_path, FOLDERS))
+    report = prepare_gift_i(raw, tmp_path / "folders", settings(tmp_path, FOLDERS))
     assert [(g["split"], g["group_id"], g["status"]) for g in report["groups"]] == [
         ("train", "hall__mirror 1", "kept"),
         ("validation", "cup", "kept"),
     ], report["groups"]
-    listed = prepare(raw, tmp_path / "lists", settings(tmp_path, lists(raw)))
+    listed = prepare_gift_i(raw, tmp_path / "lists", settings(tmp_path, lists(raw)))
     assert [g["group_id"] for g in listed["groups"]] == ["training__hall__mirror 1", "val__cup"]
     for split in ("train", "validation"):
         one, other = (load_gift_i(tmp_path / place, split)[0] for place in ("folders", "lists"))
@@ -94,7 +94,7 @@ def test_folders_and_lists_give_the_same_groups(raw, tmp_path):
 
 def test_stored_proxies_follow_their_frames_by_the_nearest_pixel(raw, tmp_path):
     out = tmp_path / "out"
-    report = prepare(raw, out, settings(tmp_path, FOLDERS))
+    report = prepare_gift_i(raw, out, settings(tmp_path, FOLDERS))
     frame = report["groups"][0]["frames"][0]
     assert frame["status"] == "warped"
     given = np.load(raw / "release/training/hall/mirror 1/proxy/0.npy")
@@ -111,7 +111,7 @@ def test_stored_proxies_follow_their_frames_by_the_nearest_pixel(raw, tmp_path):
 def test_a_missing_file_rejects_its_group(raw, tmp_path):
     (raw / "release/val/cup/proxy/1.npy").unlink()
     np.save(raw / "release/training/hall/mirror 1/proxy/1.npy", np.full((8, 8), np.nan))
-    report = prepare(raw, tmp_path / "out", settings(tmp_path, FOLDERS))
+    report = prepare_gift_i(raw, tmp_path / "out", settings(tmp_path, FOLDERS))
     first, second = (group["reasons"][0]["text"] for group in report["groups"])
     assert "finite numbers" in first and "missing release/val/cup/proxy/1.npy" in second
 
@@ -160,7 +160,7 @@ def test_paths_that_leave_the_root_are_refused(raw, tmp_path, text, line, words)
     (raw / "l.txt").write_text(f"# first\n{line}\n")
     (raw / "out").symlink_to("/etc")
     with pytest.raises((ValueError, FileNotFoundError)) as error:
-        prepare(raw, tmp_path / "out", settings(tmp_path, text))
+        prepare_gift_i(raw, tmp_path / "out", settings(tmp_path, text))
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
@@ -169,6 +169,6 @@ def test_a_link_out_of_the_root_rejects_its_group(raw, tmp_path):
     shutil.copy(mask, tmp_path / "elsewhere.png")
     mask.unlink()
     mask.symlink_to(tmp_path / "elsewhere.png")
-    report = prepare(raw, tmp_path / "out", settings(tmp_path, FOLDERS))
+    report = prepare_gift_i(raw, tmp_path / "out", settings(tmp_path, FOLDERS))
     assert report["groups"][1]["status"] == "rejected" and "leads out of" in report["groups"][1]["reasons"][0]["text"]
     assert np.asarray(Image.open(tmp_path / "elsewhere.png")).any()

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gift_peft.data.proposals import Proposal, propose, refine
+from gift_peft.prepare.proposals import Proposal, propose, refine
 
 SIZE = (120, 160)  # height, width
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from photos import scene, target, with_content
 
-from gift_peft.data import quality
-from gift_peft.data.quality import QualitySettings, Small, check_group_change, pairwise_changes
+from gift_peft.prepare import quality
+from gift_peft.prepare.quality import QualitySettings, Small, check_group_change, pairwise_changes
 
 SIZE = (240, 320)
 

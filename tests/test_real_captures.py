@@ -10,8 +10,8 @@ from photos import capture
 from PIL import Image
 from test_captures import statuses
 
-from gift_peft.data.captures import prepare
 from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.prepare.prepare import prepare_gift_i
 
 SHARED = os.path.join(os.path.dirname(__file__), "..", "..", "shared", "data")
 
@@ -36,7 +36,7 @@ def test_real_photos(tmp_path):
     for index in range(3):
         shutil.copy(f"{scene_folder}/camera_00/im{index}.png", raw / "train/shot glasses")
         mask.save(raw / f"train/shot glasses/masks/im{index}.png")
-    report = prepare(raw, out)
+    report = prepare_gift_i(raw, out)
     assert statuses(report, "shot glasses") == ["identity", "identity", "kept"]
     row = load_gift_i(out, "train")[0]
     assert row["valids"] == []
@@ -52,7 +52,7 @@ def test_real_photos(tmp_path):
 def test_a_group_of_55_images(tmp_path):
     group = capture(tmp_path / "raw/many", 5, count=55, size=(720, 1280))
     assert len(list(group.glob("*.png"))) == 55
-    report = prepare(tmp_path / "raw", tmp_path / "out")
+    report = prepare_gift_i(tmp_path / "raw", tmp_path / "out")
     assert report["statistics"]["train"]["images"] == 55 and report["statistics"]["train"]["dropped_frames"] == 0
     row = datasets.load_dataset(str(tmp_path / "out"), split="train")[0]
     assert len(row["images"]) == 55 and row["image_names"][-1] == "54.png"

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from photos import motion, moved, scene, target, with_content
 from PIL import Image
 
-from gift_peft.data import homography
-from gift_peft.data.matching import Frame, RegistrationSettings
-from gift_peft.data.registration import difference_outside, register, valid_area, warp
+from gift_peft.prepare import homography
+from gift_peft.prepare.matching import Frame, RegistrationSettings
+from gift_peft.prepare.registration import difference_outside, register, valid_area, warp
 
 SETTINGS = RegistrationSettings()
 SHARED = os.path.join(os.path.dirname(__file__), "..", "..", "shared", "data")

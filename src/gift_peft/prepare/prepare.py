@@ -60,6 +60,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -69,20 +70,19 @@ import PIL
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
-import gift_peft
 from gift_peft.captures.tree import find_groups
-from gift_peft.data.capture_group import prepare_group
-from gift_peft.data.capture_job import FORMAT, Job, Outcome
-from gift_peft.data.prepare_arguments import PrepareSettings
 from gift_peft.dataset.writer import write_card, write_rows
 from gift_peft.files import write_whole
+from gift_peft.prepare.group import prepare_group
+from gift_peft.prepare.job import FORMAT, Job, Outcome
+from gift_peft.prepare.settings import PrepareSettings
 from gift_peft.rules import SPLITS
 
 STATE = ".prepare"  # in OUT: one record per finished group, and groups on their way
 BESIDE = ("masks_proposed", "proxies_given")  # what a group may leave in OUT besides its folder
 
 
-def prepare(
+def prepare_gift_i(
     raw: str | Path,
     out: str | Path,
     settings: PrepareSettings | None = None,
@@ -128,7 +128,7 @@ def prepare(
             for name in ("README.md", "groups.jsonl"):
                 (out / name).unlink(missing_ok=True)
         write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False))
-        from gift_peft.data.capture_report import write_html
+        from gift_peft.prepare.page import write_html
 
         write_html(out, report)
     return report
@@ -310,7 +310,7 @@ def _report(raw: Path, out: Path, settings: PrepareSettings, entries: list[dict]
         "raw": Path(os.path.relpath(raw.resolve(), out.resolve())).as_posix(),
         "settings": asdict(settings),
         "versions": {
-            "gift-peft": gift_peft.__version__,
+            "gift-peft": version("gift-peft"),
             "opencv": cv2.__version__,
             "numpy": np.__version__,
             "pillow": PIL.__version__,

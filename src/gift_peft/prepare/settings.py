@@ -12,8 +12,8 @@ from pathlib import Path
 import yaml
 
 from gift_peft.captures.foreign import Layout, read_layout
-from gift_peft.data.matching import RegistrationSettings
-from gift_peft.data.quality import QualitySettings
+from gift_peft.prepare.matching import RegistrationSettings
+from gift_peft.prepare.quality import QualitySettings
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,10 @@ be made, or RAW or a configuration file is wrong, 2 for a wrong command line. Ru
 
 def run(argv: Sequence[str]) -> int:
     """`gift-peft prepare`: prepare, say in a few lines what came of it, and return the exit code."""
-    from gift_peft.data.captures import prepare
+    from gift_peft.prepare.prepare import prepare_gift_i
 
     args = parse_arguments(argv)
-    report = prepare(
+    report = prepare_gift_i(
         args.raw,
         args.out,
         args.settings,

@@ -10,7 +10,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from gift_peft.data.homography import Fit, Level, corners_of, fit_points, pyramid, transform
+from gift_peft.prepare.homography import Fit, Level, corners_of, fit_points, pyramid, transform
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gift_peft.captures.tree import Capture, read_capture
-from gift_peft.data.prepare_arguments import PrepareSettings
+from gift_peft.prepare.settings import PrepareSettings
 
 FORMAT = 1  # of records and report; a new one makes every group again
 

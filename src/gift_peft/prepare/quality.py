@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gift_peft.data.homography import normalise_contrast
+from gift_peft.prepare.homography import normalise_contrast
 
 SHRINK = 4  # comparisons between frames are made at a quarter of the size: noise and half-pixel shifts average out
 

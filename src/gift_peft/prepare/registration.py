@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from gift_peft.data.homography import Fit, corners_of, displacement, distortion, fit_pixels, transform
-from gift_peft.data.matching import Frame, Matches, RegistrationSettings, find_homography, match_frames
+from gift_peft.prepare.homography import Fit, corners_of, displacement, distortion, fit_pixels, transform
+from gift_peft.prepare.matching import Frame, Matches, RegistrationSettings, find_homography, match_frames
 
 
 @dataclass

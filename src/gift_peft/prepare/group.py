@@ -10,11 +10,11 @@ from PIL import Image
 
 from gift_peft.captures.foreign import read_proxy
 from gift_peft.captures.tree import Capture, check_masks, decode_capture
-from gift_peft.data.capture_job import Job, Outcome, capture_digest
-from gift_peft.data.matching import Frame
-from gift_peft.data.quality import Small, check_frames, check_group_change, pairwise_changes
-from gift_peft.data.registration import Registration, reason, register, valid_area, warp, warp_stored
 from gift_peft.dataset.writer import write_group
+from gift_peft.prepare.job import Job, Outcome, capture_digest
+from gift_peft.prepare.matching import Frame
+from gift_peft.prepare.quality import Small, check_frames, check_group_change, pairwise_changes
+from gift_peft.prepare.registration import Registration, reason, register, valid_area, warp, warp_stored
 from gift_peft.rules import check_count, check_group_id
 
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything
@@ -193,7 +193,7 @@ class _Group:
 
     def _propose(self) -> None:
         """Masks for a group that lacks some; they stay beside the dataset unless accepted."""
-        from gift_peft.data.proposals import propose, refine
+        from gift_peft.prepare.proposals import propose, refine
 
         drawn, self.masks = self.masks, [None] * len(self.masks)
         self._register()

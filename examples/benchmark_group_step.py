@@ -39,8 +39,8 @@ from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.loader import PreparedGroups
 from gift_peft.dataset.tensors import Group
-from gift_peft.evaluation.predict import load_base
 from gift_peft.group_step import GroupStep
+from gift_peft.models.loading import load_base
 from gift_peft.training import profiling
 from gift_peft.training.profiling import PHASES, Phases
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last

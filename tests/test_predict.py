@@ -15,8 +15,9 @@ from transformers import DepthAnythingForDepthEstimation
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import RECIPES, get_gift_model
 from gift_peft.evaluation.colormap import GREY, color_range, colorize
-from gift_peft.evaluation.predict import load_model, predict_depth, predict_images, prediction_kind
 from gift_peft.models.identity import teacher_revision
+from gift_peft.models.loading import load_model, predict_depth, prediction_kind
+from gift_peft.predict import predict_images
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +189,7 @@ def test_an_adapter_for_other_shapes_or_layers_is_refused(adapter_dir, base_dir,
 
 
 def test_an_adapter_of_another_hub_id_is_refused(adapter_dir, base_dir, tmp_path, monkeypatch):
-    from gift_peft.evaluation import predict
+    from gift_peft import predict
 
     hub = shutil.copytree(adapter_dir, tmp_path / "hub")
     config = json.loads((hub / "adapter_config.json").read_text())

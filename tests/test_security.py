@@ -24,8 +24,8 @@ from gift_peft.adapters.folder import read_adapter_config, read_gift, save_adapt
 from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.dataset.gift_i import FEATURES, gift_i_splits, load_gift_i
 from gift_peft.dataset.writer import write_gift_i
-from gift_peft.evaluation.predict import load_base, load_model
 from gift_peft.images import open_image, read_image
+from gift_peft.models.loading import load_base, load_model
 from gift_peft.models.pixels import resolve_size
 from gift_peft.training import train
 

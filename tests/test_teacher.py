@@ -18,8 +18,8 @@ from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.proxies import read_header
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.dataset.writer import write_gift_i
-from gift_peft.evaluation.predict import predict_depth
 from gift_peft.models.identity import teacher_id
+from gift_peft.models.loading import predict_depth
 from gift_peft.models.pixels import to_pixel_values
 from gift_peft.training import teacher
 from gift_peft.training.teacher import make_proxies

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from gift_peft.evaluation.predict import load_base
+from gift_peft.models.loading import load_base
 
 PAPER_MINUTES = {"depth-anything-v2-large": 4.53, "vggt-1b": 5.90, "metric3d-v2-giant2": 6.94}
 

@@ -252,7 +252,7 @@ def _evaluate(args: argparse.Namespace, rest: list[str]) -> int:
 
 
 def _predict(args: argparse.Namespace, rest: list[str]) -> int:
-    from gift_peft.evaluation.predict import predict_images
+    from gift_peft.predict import predict_images
 
     files = predict_images(
         args.images,

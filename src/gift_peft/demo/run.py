@@ -17,10 +17,10 @@ from gift_peft.evaluation.cards import run_length
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.figures import before_after
 from gift_peft.evaluation.panels import group_panels
-from gift_peft.evaluation.predict import load_model
 from gift_peft.evaluation.results import GiftIReport
 from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.files import write_whole
+from gift_peft.models.loading import load_model
 from gift_peft.training import train
 from gift_peft.training.arguments import parse_arguments
 

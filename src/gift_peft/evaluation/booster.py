@@ -16,7 +16,6 @@ import torch
 from tqdm import tqdm
 
 from gift_peft.data.booster import TOM_CLASSES, BoosterScene, GroundTruth, find_booster, read_ground_truth
-from gift_peft.evaluation.predict import prediction_kind
 from gift_peft.evaluation.predictions import PredictionFolder
 from gift_peft.evaluation.predictors import (
     Predictor,
@@ -38,6 +37,7 @@ from gift_peft.evaluation.results import (
 from gift_peft.evaluation.scoring import NO_DEPTH, Scorer, native_statistics, resize_prediction
 from gift_peft.images import read_image
 from gift_peft.losses import GeometryConsistencyError, require_finite
+from gift_peft.models.loading import prediction_kind
 from gift_peft.models.pixels import resize_mask, to_pixel_values
 
 SCENE_PIXELS = 2**20  # of a prediction kept for GCE and spread; a quarter of Booster's size has fewer

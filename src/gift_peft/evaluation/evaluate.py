@@ -17,7 +17,6 @@ from gift_peft.data.booster import find_booster
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.tensors import Group, collate_group
 from gift_peft.evaluation.booster import evaluate_booster
-from gift_peft.evaluation.predict import load_model, prediction_kind
 from gift_peft.evaluation.predictors import (
     evaluating,
     make_predictors,
@@ -38,6 +37,7 @@ from gift_peft.evaluation.results import (
 from gift_peft.evaluation.scoring import NO_DEPTH, Task, evaluate_group
 from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.files import write_whole
+from gift_peft.models.loading import load_model, prediction_kind
 
 REFERENCES = {"proxy": "native", "depth": "gift"}  # and the protocol that goes with each
 

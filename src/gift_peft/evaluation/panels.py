@@ -8,11 +8,11 @@ import torch
 from gift_peft.data.booster import find_booster, read_ground_truth
 from gift_peft.evaluation.evaluate import REFERENCES, group_collator
 from gift_peft.evaluation.figures import Panel
-from gift_peft.evaluation.predict import prediction_kind
 from gift_peft.evaluation.predictors import evaluating, make_predictors, network_size, own_processor, to_millimetres
 from gift_peft.evaluation.protocols import get_protocol
 from gift_peft.evaluation.scoring import Task, references, resize_prediction
 from gift_peft.images import read_image
+from gift_peft.models.loading import prediction_kind
 from gift_peft.models.pixels import to_pixel_values
 
 

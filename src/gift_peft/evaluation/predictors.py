@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
-from gift_peft.evaluation.predict import load_model, predict_depth
 from gift_peft.evaluation.protocols import Protocol
+from gift_peft.models.loading import load_model, predict_depth
 from gift_peft.models.pixels import resolve_size
 
 Predictor = Callable[[torch.Tensor], torch.Tensor]

@@ -19,7 +19,6 @@ from gift_peft.evaluation.compare import write_compare
 from gift_peft.evaluation.curves import draw_dynamics, draw_retention
 from gift_peft.evaluation.figures import Panel, before_after, error_maps
 from gift_peft.evaluation.layout import Table, to_csv, to_latex, to_markdown, to_text
-from gift_peft.evaluation.predict import load_model
 from gift_peft.evaluation.results import BoosterReport
 from gift_peft.evaluation.runs import SavedRun, folder_names, read_run, run_names
 from gift_peft.evaluation.statistics import value_of
@@ -27,6 +26,7 @@ from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table
 from gift_peft.evaluation.zero_shot import checkpoint_folders, draw_zero_shot
 from gift_peft.files import write_whole
 from gift_peft.images import list_images
+from gift_peft.models.loading import load_model
 
 WEIGHTS = "adapter_model.safetensors"
 COMPARED_GROUPS = 40  # compare.html has one observation of that many groups at most: it has to open in a browser

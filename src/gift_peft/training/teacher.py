@@ -22,8 +22,8 @@ from gift_peft.dataset.proxies import (
     row_digests,
     write_proxies,
 )
-from gift_peft.evaluation.predict import load_base, predict_depth
 from gift_peft.models.identity import teacher_id, teacher_revision
+from gift_peft.models.loading import load_base, predict_depth
 from gift_peft.models.pixels import pixel_settings, resolve_size, to_pixel_values
 
 if TYPE_CHECKING:

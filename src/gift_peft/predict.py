@@ -1,0 +1,106 @@
+"""Depth for single pictures (`gift-peft predict`).
+
+Pictures are resized as in training and the prediction is brought back to each picture's own size with the bicubic
+interpolation of transformers' `post_process_depth_estimation`. Values stay in the network's native units.
+"""
+
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from tqdm import tqdm
+
+from gift_peft.evaluation.colormap import color_range, colorize
+from gift_peft.files import write_whole
+from gift_peft.images import list_images, read_image
+from gift_peft.models.loading import load_model, predict_depth
+from gift_peft.models.pixels import to_pixel_values
+
+
+def predict_images(
+    images: Sequence[str | Path],
+    base: str | Path,
+    adapter: str | Path | None = None,
+    adapter_scale: float | None = None,
+    *,
+    out: str | Path,
+    size: str | tuple[int, int] | None = None,
+    kind: str | None = None,
+    revision: str | None = None,
+    device: str | torch.device | None = None,
+    progress: bool = True,
+) -> list[Path]:
+    """Writes `<stem>.npy` and `<stem>.png` per picture and, with an adapter, `<stem>_base.npy/.png` beside them.
+
+    The npy is (H,W) float32 at the picture's own size, in the model's native units: relative inverse depth for a
+    relative Depth Anything (large is near), depth for metric models. The two PNGs of a picture share one colour range;
+    near is bright. Pictures of one stem become `<stem>-2` and so on.
+
+    Args:
+        images: files, or folders whose pictures are taken.
+        base, adapter, adapter_scale, revision, size, device: as in `load_model`.
+        out: folder; made if missing, existing files of these names are replaced.
+        kind (`str`, *optional*): decides which end is bright; default the recipe's.
+
+    Returns:
+        `list[Path]`: the npy file of each picture.
+
+    Raises:
+        FileNotFoundError: a picture, base or adapter that is not there. ValueError: an unreadable picture, a
+            non-finite prediction, an adapter for another base.
+    """
+    files = list_images(images)
+    names = _unique_names(files, beside=adapter is not None)
+    loaded = load_model(base, adapter, adapter_scale, revision, size, device)
+    kind = kind or loaded.kind
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, name in tqdm(
+        list(zip(files, names, strict=True)), desc="predict", unit="image", disable=None if progress else True
+    ):
+        image = read_image(file)
+        pixel_values = to_pixel_values([image], loaded.processor, loaded.size)
+        depths = {name: _at_image_size(predict_depth(loaded.model, pixel_values), image, file)}
+        if adapter is not None:
+            with loaded.model.disable_adapter():
+                depths[f"{name}_base"] = _at_image_size(predict_depth(loaded.model, pixel_values), image, file)
+        low, high = color_range(*depths.values())
+        for stem, depth in depths.items():
+            picture = Image.fromarray(colorize(depth, low, high, kind or "inverse_depth"))
+            _write(folder / f"{stem}.npy", lambda file, depth=depth: np.save(file, depth))
+            _write(folder / f"{stem}.png", lambda file, picture=picture: picture.save(file, "PNG"))
+    return [folder / f"{name}.npy" for name in names]
+
+
+def _write(path: Path, save: Callable[[io.BytesIO], None]) -> None:
+    content = io.BytesIO()
+    save(content)
+    write_whole(path, content.getvalue())
+
+
+def _at_image_size(depth: torch.Tensor, image: Image.Image, file: Path) -> np.ndarray:
+    """(1,h,w) to the picture's (H,W) as transformers does it; ValueError for NaN and infinity."""
+    if not torch.isfinite(depth).all():
+        raise ValueError(f"{file}: the prediction has NaN or infinite values")
+    size = (image.height, image.width)
+    return torch.nn.functional.interpolate(depth[None], size=size, mode="bicubic", align_corners=False)[0, 0].numpy()
+
+
+def _unique_names(files: Sequence[Path], beside: bool) -> list[str]:
+    """A file name per picture; `beside` keeps `<name>_base` free as well."""
+    taken: set[str] = set()
+    names = []
+    for file in files:
+        number, name = 1, file.stem
+        while {name, f"{name}_base"} & taken if beside else name in taken:
+            number += 1
+            name = f"{file.stem}-{number}"
+        taken |= {name, f"{name}_base"} if beside else {name}
+        names.append(name)
+    return names
+
+
+# ---- adapters ----

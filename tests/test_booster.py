@@ -7,12 +7,7 @@ import pytest
 from booster_tree import CALIBRATION, nearest, write_root, write_scene
 from PIL import Image
 
-from gift_peft.data.booster import (
-    OFFICIAL_SCENES,
-    find_booster,
-    read_calibration,
-    read_ground_truth,
-)
+from gift_peft.evaluation.booster_scenes import OFFICIAL_SCENES, find_booster, read_calibration, read_ground_truth
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gift_peft.dataset.tensors import Group
-from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.evaluation.results import REGIONS, GiftIReport
 from gift_peft.evaluation.scoring import consensus
 

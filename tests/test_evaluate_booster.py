@@ -17,7 +17,7 @@ from PIL import Image
 from tiny import SIZE, tiny_model, tiny_processor
 
 from gift_peft import evaluate_booster
-from gift_peft.data.booster import find_booster, read_ground_truth
+from gift_peft.evaluation.booster_scenes import find_booster, read_ground_truth
 from gift_peft.evaluation.protocols import Protocol
 from gift_peft.evaluation.results import REGIONS, BoosterReport, GiftIReport, load_report
 

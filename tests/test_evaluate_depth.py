@@ -11,7 +11,7 @@ from tiny import SIZE, tiny_model, tiny_processor
 
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.writer import write_gift_i
-from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.evaluation.panels import group_panels
 from gift_peft.evaluation.results import REGIONS
 from gift_peft.evaluation.tables import text_table

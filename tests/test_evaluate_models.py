@@ -10,8 +10,9 @@ from tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
 
 from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.evaluation.evaluate import evaluate_gift_i, run_evaluation
+from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.evaluation.results import GiftIReport
+from gift_peft.evaluation.verb import run_evaluation
 from gift_peft.training.teacher import make_proxies
 
 

@@ -12,7 +12,7 @@ from torch import nn
 from transformers import DPTConfig, DPTForDepthEstimation, DPTImageProcessorPil
 
 from gift_peft import evaluate_booster
-from gift_peft.evaluation.evaluate import run_booster, run_evaluation
+from gift_peft.evaluation.verb import run_booster, run_evaluation
 from gift_peft.models.loading import load_model, predict_depth
 from gift_peft.models.pixels import to_pixel_values
 from gift_peft.predict import predict_images

@@ -5,8 +5,8 @@ import pytest
 from booster_tree import write_scene
 from PIL import Image
 
-from gift_peft.data.booster import find_booster
-from gift_peft.evaluation.predictions import PredictionFolder
+from gift_peft.evaluation.booster_scenes import find_booster
+from gift_peft.evaluation.stored_predictions import PredictionFolder
 
 VALUES = np.arange(12, dtype=np.float32).reshape(3, 4) + 1
 

@@ -20,10 +20,10 @@ from tiny import write_raw_tree
 
 from gift_peft import cli
 from gift_peft.evaluation.ablation import ablation_table, is_ablation
-from gift_peft.evaluation.evaluate import run_booster, run_evaluation
 from gift_peft.evaluation.report import notable_observations, run_report
 from gift_peft.evaluation.results import GiftIReport
 from gift_peft.evaluation.runs import SavedRun, read_run, run_names
+from gift_peft.evaluation.verb import run_booster, run_evaluation
 from gift_peft.evaluation.zero_shot import checkpoint_folders
 from gift_peft.training import train
 

@@ -12,7 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reports import make_report, metrics, random_rows, report_of
 
-from gift_peft.evaluation.layout import (
+from gift_peft.evaluation.metrics import METRICS
+from gift_peft.evaluation.protocols import PROTOCOLS
+from gift_peft.evaluation.results import REGIONS, GiftIReport
+from gift_peft.evaluation.statistics import GroupBootstrap, mean_interval, median_of
+from gift_peft.evaluation.table_formats import (
     Cell,
     Table,
     change_cell,
@@ -24,10 +28,6 @@ from gift_peft.evaluation.layout import (
     to_text,
     value_cell,
 )
-from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.protocols import PROTOCOLS
-from gift_peft.evaluation.results import REGIONS, GiftIReport
-from gift_peft.evaluation.statistics import GroupBootstrap, mean_interval, median_of
 from gift_peft.evaluation.tables import (
     BACKBONE_UNITS,
     NO_TEACHING,

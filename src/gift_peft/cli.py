@@ -213,7 +213,7 @@ def _evaluate(args: argparse.Namespace, rest: list[str]) -> int:
         args.usage_error("one of --base and --predictions is required")
     if args.predictions and (args.dataset or args.adapter):
         args.usage_error("--predictions go with --booster, and without --adapter")
-    from gift_peft.evaluation.evaluate import run_booster, run_evaluation
+    from gift_peft.evaluation.verb import run_booster, run_evaluation
 
     common = {
         "out": args.out,

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.evaluation.cards import run_length
-from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.figures import before_after
+from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.evaluation.panels import group_panels
 from gift_peft.evaluation.results import GiftIReport
 from gift_peft.evaluation.tables import markdown_table, text_table

@@ -12,9 +12,9 @@ import yaml
 
 from gift_peft.evaluation.bases import Base, adapter_sizes, find_base
 from gift_peft.evaluation.card_metadata import card_metadata, is_local, portable_name
-from gift_peft.evaluation.layout import number, to_markdown
 from gift_peft.evaluation.metrics import METRICS
 from gift_peft.evaluation.results import REGIONS, BoosterReport
+from gift_peft.evaluation.table_formats import number, to_markdown
 from gift_peft.evaluation.tables import (
     METRIC_NAMES,
     NO_TEACHING,

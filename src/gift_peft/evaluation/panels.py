@@ -5,9 +5,9 @@ from typing import Any
 
 import torch
 
-from gift_peft.data.booster import find_booster, read_ground_truth
-from gift_peft.evaluation.evaluate import REFERENCES, group_collator
+from gift_peft.evaluation.booster_scenes import find_booster, read_ground_truth
 from gift_peft.evaluation.figures import Panel
+from gift_peft.evaluation.on_gift_i import REFERENCES, group_collator
 from gift_peft.evaluation.predictors import evaluating, make_predictors, network_size, own_processor, to_millimetres
 from gift_peft.evaluation.protocols import get_protocol
 from gift_peft.evaluation.scoring import Task, references, resize_prediction

@@ -18,10 +18,10 @@ from gift_peft.evaluation.cards import model_card
 from gift_peft.evaluation.compare import write_compare
 from gift_peft.evaluation.curves import draw_dynamics, draw_retention
 from gift_peft.evaluation.figures import Panel, before_after, error_maps
-from gift_peft.evaluation.layout import Table, to_csv, to_latex, to_markdown, to_text
 from gift_peft.evaluation.results import BoosterReport
 from gift_peft.evaluation.runs import SavedRun, folder_names, read_run, run_names
 from gift_peft.evaluation.statistics import value_of
+from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
 from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table, protocol_note, uncertainty_table
 from gift_peft.evaluation.zero_shot import checkpoint_folders, draw_zero_shot
 from gift_peft.files import write_whole
@@ -155,7 +155,7 @@ def _is_of_adapter(run: SavedRun, report: AnyReport) -> bool:
 def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> None:
     if run.evaluations or run.adapter is None:
         return
-    from gift_peft.evaluation.evaluate import run_evaluation
+    from gift_peft.evaluation.verb import run_evaluation
 
     arguments = run.arguments
     try:

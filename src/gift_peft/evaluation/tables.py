@@ -9,7 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gift_peft.evaluation.layout import (
+from gift_peft.evaluation.metrics import METRICS
+from gift_peft.evaluation.results import COLLAPSE_RANGE, REGIONS, BoosterReport, GiftIReport, mean
+from gift_peft.evaluation.statistics import GroupBootstrap, mean_interval, median_of, value_of
+from gift_peft.evaluation.table_formats import (
     Cell,
     Table,
     change_cell,
@@ -19,9 +22,6 @@ from gift_peft.evaluation.layout import (
     to_text,
     value_cell,
 )
-from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.results import COLLAPSE_RANGE, REGIONS, BoosterReport, GiftIReport, mean
-from gift_peft.evaluation.statistics import GroupBootstrap, mean_interval, median_of, value_of
 
 AnyReport = GiftIReport | BoosterReport
 

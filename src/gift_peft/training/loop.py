@@ -19,13 +19,13 @@ from accelerate.utils import broadcast_object_list, set_seed
 
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import GiftRecipe, get_gift_model, get_recipe
-from gift_peft.data.booster import find_booster
 from gift_peft.dataset.cache import default_cache_dir
 from gift_peft.dataset.gift_i import dataset_fingerprint, gift_i_splits, load_gift_i, proxies_command
 from gift_peft.dataset.loader import PreparedGroups, epoch_order
 from gift_peft.dataset.tensors import Group
+from gift_peft.evaluation.booster_scenes import find_booster
 from gift_peft.evaluation.cards import model_card
-from gift_peft.evaluation.layout import number
+from gift_peft.evaluation.table_formats import number
 from gift_peft.evaluation.tables import relative_change
 from gift_peft.files import jsonable
 from gift_peft.group_step import GroupStep

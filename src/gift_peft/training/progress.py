@@ -5,7 +5,7 @@ import time
 
 from tqdm import tqdm
 
-from gift_peft.evaluation.layout import number
+from gift_peft.evaluation.table_formats import number
 
 
 class Progress:

@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from gift_peft.data.booster import TOM_CLASSES, BoosterScene, GroundTruth, find_booster, read_ground_truth
-from gift_peft.evaluation.predictions import PredictionFolder
+from gift_peft.evaluation.booster_scenes import TOM_CLASSES, BoosterScene, GroundTruth, find_booster, read_ground_truth
 from gift_peft.evaluation.predictors import (
     Predictor,
     evaluating,
@@ -35,6 +34,7 @@ from gift_peft.evaluation.results import (
     summarize_gce,
 )
 from gift_peft.evaluation.scoring import NO_DEPTH, Scorer, native_statistics, resize_prediction
+from gift_peft.evaluation.stored_predictions import PredictionFolder
 from gift_peft.images import read_image
 from gift_peft.losses import GeometryConsistencyError, require_finite
 from gift_peft.models.loading import prediction_kind
@@ -75,7 +75,7 @@ def evaluate_booster(
     `num_nonpositive` of its alignment, and the metrics of `all`, `tom` and `other` in mm.
 
     Args:
-        root: of the data, at any of three levels (`gift_peft.data.booster`).
+        root: of the data, at any of three levels (`gift_peft.evaluation.booster_scenes`).
         model, teacher: as in `evaluate_gift_i`: a `PeftModel`; or a model or callable (B,3,h,w) -> (B,H,W) beside a
             `teacher`; or the base alone.
         predictions: folder `<Scene>/camera_00/<image stem>.npy` (or npz, pfm, png), any size, in place of a model.

@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from gift_peft.data.booster import find_booster
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.tensors import Group, collate_group
-from gift_peft.evaluation.booster import evaluate_booster
 from gift_peft.evaluation.predictors import (
     evaluating,
     make_predictors,
@@ -26,7 +24,6 @@ from gift_peft.evaluation.predictors import (
 )
 from gift_peft.evaluation.protocols import Protocol, get_protocol
 from gift_peft.evaluation.results import (
-    BoosterReport,
     GiftIReport,
     by_surface,
     count_rows,
@@ -35,9 +32,7 @@ from gift_peft.evaluation.results import (
     summarize_gce,
 )
 from gift_peft.evaluation.scoring import NO_DEPTH, Task, evaluate_group
-from gift_peft.evaluation.tables import markdown_table, text_table
-from gift_peft.files import write_whole
-from gift_peft.models.loading import load_model, prediction_kind
+from gift_peft.models.loading import prediction_kind
 
 REFERENCES = {"proxy": "native", "depth": "gift"}  # and the protocol that goes with each
 
@@ -132,103 +127,6 @@ def evaluate_gift_i(
     if reference == "depth" and all(row["skipped"] == NO_DEPTH for row in rows):
         raise ValueError('no group of the dataset has true depth; evaluate against the proxies (reference="proxy")')
     return _report(groups, rows, task)
-
-
-def run_evaluation(
-    base: str | Path,
-    dataset: str | Path,
-    adapter: str | Path | None = None,
-    *,
-    reference: str = "proxy",
-    protocol: str | None = None,
-    split: str = "validation",
-    out: str | Path = "evaluation",
-    adapter_scale: float | None = None,
-    size: str | tuple[int, int] | None = None,
-    kind: str | None = None,
-    revision: str | None = None,
-    dataset_revision: str | None = None,
-    prediction_scale: float | None = None,
-    batch_size: int = 2,
-    device: str | None = None,
-    color: bool = False,
-    progress: bool = True,
-) -> GiftIReport:
-    """`gift-peft evaluate`: loads, evaluates, prints the table, writes `metrics.json`, `rows.jsonl`, `report.md`."""
-    loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
-    groups = load_gift_i(dataset, split, dataset_revision=dataset_revision)
-    report = evaluate_gift_i(
-        groups,
-        loaded.model,
-        protocol=protocol,
-        reference=reference,
-        processor=loaded.processor,
-        size=loaded.size,
-        kind=kind or loaded.kind,
-        prediction_scale=prediction_scale,
-        batch_size=batch_size,
-        progress=progress,
-    )
-    report.about = {
-        "base": str(base),
-        "revision": revision,
-        "adapter": adapter and str(adapter),
-        "adapter_scale": adapter_scale,
-        "dataset": str(dataset),
-        "dataset_revision": dataset_revision,
-        "split": split,
-        "size": list(loaded.size),
-        "kind": kind or loaded.kind,
-    }
-    write_report(report, out, color)
-    return report
-
-
-def run_booster(
-    root: str | Path,
-    base: str | Path | None = None,
-    adapter: str | Path | None = None,
-    *,
-    predictions: str | Path | None = None,
-    out: str | Path = "evaluation",
-    adapter_scale: float | None = None,
-    size: str | tuple[int, int] | None = None,
-    kind: str | None = None,
-    revision: str | None = None,
-    device: str | None = None,
-    color: bool = False,
-    **options: Any,
-) -> BoosterReport:
-    """`gift-peft evaluate --booster`: as `run_evaluation`, of a base or of stored predictions.
-
-    `options` are those of `evaluate_booster`.
-    """
-    if predictions is not None:
-        report = evaluate_booster(root, predictions=predictions, kind=kind, **options)
-    else:
-        # What is wrong with these is said before large weights are loaded.
-        get_protocol(options.get("protocol", "gift"))
-        find_booster(root, options.get("subset"), options.get("official"))
-        loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
-        options |= {"processor": loaded.processor, "size": loaded.size, "kind": kind or loaded.kind}
-        report = evaluate_booster(root, loaded.model, **options)
-        report.about |= {
-            "base": str(base),
-            "revision": revision,
-            "adapter": adapter and str(adapter),
-            "adapter_scale": adapter_scale,
-            "size": list(loaded.size),
-        }
-    write_report(report, out, color)
-    return report
-
-
-def write_report(report: GiftIReport | BoosterReport, out: str | Path, color: bool = False) -> None:
-    """Leaves the report in a folder and prints its table."""
-    folder = report.save(out)
-    write_whole(folder / "report.md", markdown_table(report))
-    print(text_table(report, color=color))
-    print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
 
 
 def group_collator(dataset: Any, model: Any, processor: Any, size: Any) -> Callable[[dict], Group]:

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from gift_peft.data.booster import CAMERA, BoosterScene
+from gift_peft.evaluation.booster_scenes import CAMERA, BoosterScene
 from gift_peft.images import open_image
 
 SUFFIXES = (".npy", ".npz", ".pfm", ".png")

@@ -12,8 +12,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from gift_peft.evaluation.report import run_report
 from gift_peft.evaluation.verb import run_evaluation
+from gift_peft.reports.report import run_report
 from gift_peft.training import train
 from gift_peft.training.arguments import parse_arguments
 

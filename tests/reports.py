@@ -3,7 +3,6 @@
 import numpy as np
 from PIL import Image
 
-from gift_peft.evaluation.figures import Panel
 from gift_peft.evaluation.metrics import METRICS
 from gift_peft.evaluation.protocols import PROTOCOLS
 from gift_peft.evaluation.results import (
@@ -15,6 +14,7 @@ from gift_peft.evaluation.results import (
     summarize,
     summarize_gce,
 )
+from gift_peft.reports.figures import Panel
 
 
 def metrics(mae, abs_rel, rmse, delta1):

@@ -23,10 +23,10 @@ from gift_peft import (
     get_gift_model,
 )
 from gift_peft.dataset.writer import write_gift_i
-from gift_peft.evaluation import cards
-from gift_peft.evaluation.bases import adapter_sizes, find_base
-from gift_peft.evaluation.card_metadata import base_license, is_local, portable_name
 from gift_peft.evaluation.metrics import METRICS
+from gift_peft.reports import model_card
+from gift_peft.reports.backbones import adapter_sizes, find_base
+from gift_peft.reports.card_metadata import base_license, is_local, portable_name
 from gift_peft.training import card, loop, start, train
 from gift_peft.training.arguments import GiftTrainingArguments
 
@@ -48,7 +48,7 @@ RECORD = {
 def make(tmp_path, adapted, **changes):
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out", **changes)
     record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
-    (tmp_path / "README.md").write_text(cards.model_card(asdict(args), record))
+    (tmp_path / "README.md").write_text(model_card.model_card(asdict(args), record))
     return ModelCard.load(tmp_path / "README.md")
 
 
@@ -199,7 +199,7 @@ def test_every_evaluation_keeps_its_own_metrics(tmp_path):
     booster = report_of(random_rows([2, 3], seed=2), booster=True)
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out")
     record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
-    loaded = ModelCard(cards.model_card(asdict(args), record, [proxy, depth, booster]))
+    loaded = ModelCard(model_card.model_card(asdict(args), record, [proxy, depth, booster]))
     found = {}
     for result in loaded.data.eval_results:
         found.setdefault((result.dataset_type, result.dataset_config), {})[result.metric_type] = result.metric_value
@@ -220,10 +220,10 @@ def test_what_got_worse_stands_under_limits():
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out")
     adapted = ROW | {"val_tom_rmse": 0.2, "val_other_rmse": 0.3}
     record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
-    limits = cards.model_card(asdict(args), record).split("## Limits")[1]
+    limits = model_card.model_card(asdict(args), record).split("## Limits")[1]
     assert "Other RMSE on the validation groups got worse, by 20.0 %" in limits and "ToM RMSE" not in limits
     report = report_of(random_rows([2, 3]), collapse={"target_mean_ratio": 0.1, "spread_ratio": 1.0, "alarm": True})
-    assert "Collapse alarm on GIFT-I (proxy)" in cards.model_card(asdict(args), record, [report])
+    assert "Collapse alarm on GIFT-I (proxy)" in model_card.model_card(asdict(args), record, [report])
 
 
 CARDS = {
@@ -238,7 +238,7 @@ ROOT = Path(__file__).parents[1]
 def test_cards_of_backbones_are_what_the_generator_writes(name):
     arguments = yaml.safe_load((ROOT / "examples" / f"{name}.yaml").read_text())
     text = (ROOT / "model_cards" / f"{name}.md").read_text()
-    assert text == cards.model_card(arguments)
+    assert text == model_card.model_card(arguments)
     loaded = ModelCard(text)
     base, license, parameters = CARDS[name]
     data = loaded.data.to_dict()
@@ -291,10 +291,10 @@ def test_a_trained_folder_is_not_taken_for_the_backbone_it_is_named_after(base_d
     (tmp_path / "vggt-1b").mkdir()
     args = GiftTrainingArguments("vggt-1b", "someone/gift-i", "out")
     record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
-    loaded = ModelCard(cards.model_card(asdict(args), record))
+    loaded = ModelCard(model_card.model_card(asdict(args), record))
     assert loaded.data.base_model is None and "paper" not in loaded.text
     with pytest.raises(ValueError, match="needs model_name_or_path"):
-        cards.model_card({})
+        model_card.model_card({})
 
 
 def test_the_dataset_card_is_valid(tmp_path):

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from reports import panel
 
-from gift_peft.evaluation.compare import write_compare
-from gift_peft.evaluation.figures import panel_row
+from gift_peft.reports.compare import write_compare
+from gift_peft.reports.figures import panel_row
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 OPTIONS = [

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gift_peft.evaluation import curves
-from gift_peft.evaluation.curves import COLORS, DASHES, draw_dynamics, draw_retention, normalised, smooth
+from gift_peft.reports import curves
+from gift_peft.reports.curves import COLORS, DASHES, draw_dynamics, draw_retention, normalised, smooth
 
 pytest.importorskip("matplotlib")
 

@@ -12,9 +12,9 @@ from tiny import SIZE, tiny_model, tiny_processor
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.evaluation.on_gift_i import evaluate_gift_i
-from gift_peft.evaluation.panels import group_panels
 from gift_peft.evaluation.results import REGIONS
 from gift_peft.evaluation.tables import text_table
+from gift_peft.reports.panels import group_panels
 
 OPTIONS = {"processor": tiny_processor(), "size": SIZE, "progress": False}
 

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image, ImageDraw
 from reports import panel
 
-from gift_peft.evaluation.colormap import GREY, colorize_error
-from gift_peft.evaluation.figures import (
+from gift_peft.colormap import GREY, colorize_error
+from gift_peft.reports.figures import (
     CAPTION,
     GAP,
     HEADER,

@@ -14,7 +14,7 @@ from transformers import DepthAnythingForDepthEstimation
 
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import RECIPES, get_gift_model
-from gift_peft.evaluation.colormap import GREY, color_range, colorize
+from gift_peft.colormap import GREY, color_range, colorize
 from gift_peft.models.identity import teacher_revision
 from gift_peft.models.loading import load_model, predict_depth, prediction_kind
 from gift_peft.predict import predict_images

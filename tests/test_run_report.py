@@ -19,12 +19,12 @@ from runs import arguments
 from tiny import write_raw_tree
 
 from gift_peft import cli
-from gift_peft.evaluation.ablation import ablation_table, is_ablation
-from gift_peft.evaluation.report import notable_observations, run_report
 from gift_peft.evaluation.results import GiftIReport
-from gift_peft.evaluation.runs import SavedRun, read_run, run_names
 from gift_peft.evaluation.verb import run_booster, run_evaluation
-from gift_peft.evaluation.zero_shot import checkpoint_folders
+from gift_peft.reports.ablation import ablation_table, is_ablation
+from gift_peft.reports.report import notable_observations, run_report
+from gift_peft.reports.saved_run import SavedRun, read_run, run_names
+from gift_peft.reports.zero_shot import checkpoint_folders
 from gift_peft.training import train
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.

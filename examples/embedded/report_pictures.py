@@ -16,7 +16,7 @@ from pathlib import Path
 from PIL import Image
 
 from gift_peft.demo.run import KINDS
-from gift_peft.evaluation.report import run_report
+from gift_peft.reports.report import run_report
 
 CARDS = Path(__file__).parents[2] / "model_cards"
 FIGURES = {"before-after": "panels", "errors": "errors", "dynamics": "dynamics", "retention": "retention"}

@@ -269,7 +269,7 @@ def _predict(args: argparse.Namespace, rest: list[str]) -> int:
 
 
 def _report(args: argparse.Namespace, rest: list[str]) -> int:
-    from gift_peft.evaluation.report import run_report
+    from gift_peft.reports.report import run_report
 
     run_report(
         args.runs,

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.evaluation.colormap import color_range, colorize
+from gift_peft.colormap import color_range, colorize
 from gift_peft.files import write_whole
 from gift_peft.images import list_images, read_image
 from gift_peft.models.loading import load_model, predict_depth

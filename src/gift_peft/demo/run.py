@@ -13,14 +13,14 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.evaluation.cards import run_length
-from gift_peft.evaluation.figures import before_after
 from gift_peft.evaluation.on_gift_i import evaluate_gift_i
-from gift_peft.evaluation.panels import group_panels
 from gift_peft.evaluation.results import GiftIReport
 from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.files import write_whole
 from gift_peft.models.loading import load_model
+from gift_peft.reports.figures import before_after
+from gift_peft.reports.model_card import run_length
+from gift_peft.reports.panels import group_panels
 from gift_peft.training import train
 from gift_peft.training.arguments import parse_arguments
 

@@ -1,7 +1,7 @@
 """What goes with an adapter: the record for gift.json, and the upload of adapter, record and card to the Hub.
 
 The record holds no path of this machine; a local base or dataset appears by its folder's name only, as in the card
-(`gift_peft.evaluation.cards`).
+(`gift_peft.reports.model_card`).
 """
 
 import functools
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from gift_peft.evaluation.card_metadata import is_local, portable_name
+from gift_peft.reports.card_metadata import is_local, portable_name
 from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 
 UPLOADED = ["adapter_model.safetensors", "adapter_config.json", "gift.json", "preprocessor_config.json", "README.md"]

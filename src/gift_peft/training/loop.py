@@ -24,7 +24,6 @@ from gift_peft.dataset.gift_i import dataset_fingerprint, gift_i_splits, load_gi
 from gift_peft.dataset.loader import PreparedGroups, epoch_order
 from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.booster_scenes import find_booster
-from gift_peft.evaluation.cards import model_card
 from gift_peft.evaluation.table_formats import number
 from gift_peft.evaluation.tables import relative_change
 from gift_peft.files import jsonable
@@ -32,6 +31,7 @@ from gift_peft.group_step import GroupStep
 from gift_peft.models.identity import teacher_revision
 from gift_peft.models.loading import load_base
 from gift_peft.models.pixels import resolve_size
+from gift_peft.reports.model_card import model_card
 from gift_peft.training import card, checkpoints, validation
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
 from gift_peft.training.profiling import profile_updates

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from gift_peft.colormap import color_range, colorize, colorize_error
 from gift_peft.evaluation.alignment import align, known
-from gift_peft.evaluation.colormap import color_range, colorize, colorize_error
 from gift_peft.evaluation.metrics import depth_metrics
 from gift_peft.evaluation.protocols import get_protocol
 

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gift_peft.evaluation.curves import DIVERGED
 from gift_peft.evaluation.protocols import PROTOCOLS
 from gift_peft.evaluation.results import BoosterReport, GiftIReport
-from gift_peft.evaluation.runs import SavedRun, ratio
 from gift_peft.evaluation.table_formats import Cell, Table, value_cell
 from gift_peft.evaluation.tables import protocol_note, skipped_note
+from gift_peft.reports.curves import DIVERGED
+from gift_peft.reports.saved_run import SavedRun, ratio
 
 # Column of metrics.jsonl, its heading; the last two from a Booster evaluation where training logged none.
 COLUMNS = {

@@ -9,7 +9,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from gift_peft.evaluation.figures import import_pyplot
+from gift_peft.reports.figures import import_pyplot
 
 # Figure 5; of Figure 6 whichever a run has.
 DYNAMICS = {"train_gce": "train GCE", "val_gce": "validation GCE", "booster_tom_rmse": "Booster ToM RMSE"}

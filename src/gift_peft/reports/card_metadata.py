@@ -9,10 +9,10 @@ from typing import Any
 
 import yaml
 
-from gift_peft.evaluation.bases import BASES, Base
 from gift_peft.evaluation.metrics import METRICS
 from gift_peft.evaluation.results import REGIONS, BoosterReport
 from gift_peft.evaluation.tables import REGION_NAMES, AnyReport
+from gift_peft.reports.backbones import BASES, Base
 
 # As the models' pages state them: of Depth Anything V2 only the small one may be used commercially.
 LICENSES = {

@@ -13,20 +13,20 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from gift_peft.evaluation.ablation import ablation_table, is_ablation
-from gift_peft.evaluation.cards import model_card
-from gift_peft.evaluation.compare import write_compare
-from gift_peft.evaluation.curves import draw_dynamics, draw_retention
-from gift_peft.evaluation.figures import Panel, before_after, error_maps
 from gift_peft.evaluation.results import BoosterReport
-from gift_peft.evaluation.runs import SavedRun, folder_names, read_run, run_names
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
 from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table, protocol_note, uncertainty_table
-from gift_peft.evaluation.zero_shot import checkpoint_folders, draw_zero_shot
 from gift_peft.files import write_whole
 from gift_peft.images import list_images
 from gift_peft.models.loading import load_model
+from gift_peft.reports.ablation import ablation_table, is_ablation
+from gift_peft.reports.compare import write_compare
+from gift_peft.reports.curves import draw_dynamics, draw_retention
+from gift_peft.reports.figures import Panel, before_after, error_maps
+from gift_peft.reports.model_card import model_card
+from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_names
+from gift_peft.reports.zero_shot import checkpoint_folders, draw_zero_shot
 
 WEIGHTS = "adapter_model.safetensors"
 COMPARED_GROUPS = 40  # compare.html has one observation of that many groups at most: it has to open in a browser
@@ -361,7 +361,7 @@ def _group_rows(report: AnyReport) -> Callable[[str], dict]:
 
 
 def _group_panels(report, find, group_id: str, labels: dict[str, str], loaded, options: dict) -> list[Panel]:
-    from gift_peft.evaluation.panels import group_panels, scene_panels
+    from gift_peft.reports.panels import group_panels, scene_panels
 
     if isinstance(report, BoosterReport):
         return scene_panels(report.about, group_id, labels, loaded.model, **options)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import yaml
 
-from gift_peft.evaluation.card_metadata import portable_name
 from gift_peft.evaluation.results import load_report
 from gift_peft.evaluation.tables import AnyReport
+from gift_peft.reports.card_metadata import portable_name
 
 
 @dataclass

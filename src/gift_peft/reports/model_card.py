@@ -10,8 +10,6 @@ from typing import Any
 
 import yaml
 
-from gift_peft.evaluation.bases import Base, adapter_sizes, find_base
-from gift_peft.evaluation.card_metadata import card_metadata, is_local, portable_name
 from gift_peft.evaluation.metrics import METRICS
 from gift_peft.evaluation.results import REGIONS, BoosterReport
 from gift_peft.evaluation.table_formats import number, to_markdown
@@ -25,6 +23,8 @@ from gift_peft.evaluation.tables import (
     relative_change,
     uncertainty_table,
 )
+from gift_peft.reports.backbones import Base, adapter_sizes, find_base
+from gift_peft.reports.card_metadata import card_metadata, is_local, portable_name
 
 NOT_TRAINED = "**Not trained yet.** This page says how the adapter is made; it gets its results from the training run."
 KINDS = {

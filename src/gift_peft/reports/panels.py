@@ -6,7 +6,6 @@ from typing import Any
 import torch
 
 from gift_peft.evaluation.booster_scenes import find_booster, read_ground_truth
-from gift_peft.evaluation.figures import Panel
 from gift_peft.evaluation.on_gift_i import REFERENCES, group_collator
 from gift_peft.evaluation.predictors import evaluating, make_predictors, network_size, own_processor, to_millimetres
 from gift_peft.evaluation.protocols import get_protocol
@@ -14,6 +13,7 @@ from gift_peft.evaluation.scoring import Task, references, resize_prediction
 from gift_peft.images import read_image
 from gift_peft.models.loading import prediction_kind
 from gift_peft.models.pixels import to_pixel_values
+from gift_peft.reports.figures import Panel
 
 
 def group_panels(

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gift_peft.evaluation.figures import GridRow, Panel, outline, panel_row
 from gift_peft.files import write_whole
+from gift_peft.reports.figures import GridRow, Panel, outline, panel_row
 
 MIN_SIDE = 320  # smaller tiles are enlarged, so that the outline is a line and not a row of blocks
 

@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from gift_peft.evaluation.figures import prediction_row, save_grid
-from gift_peft.evaluation.runs import SavedRun
 from gift_peft.evaluation.scoring import resize_prediction
 from gift_peft.images import list_images, read_image
 from gift_peft.models.loading import load_model, predict_depth
 from gift_peft.models.pixels import to_pixel_values
+from gift_peft.reports.figures import prediction_row, save_grid
+from gift_peft.reports.saved_run import SavedRun
 
 LONG_SIDE = 720  # of a picture in the figure
 

@@ -27,7 +27,7 @@ from gift_peft.evaluation.metrics import METRICS
 from gift_peft.reports import model_card
 from gift_peft.reports.backbones import adapter_sizes, find_base
 from gift_peft.reports.card_metadata import base_license, is_local, portable_name
-from gift_peft.training import card, loop, start, train
+from gift_peft.training import loop, start, train, upload
 from gift_peft.training.arguments import GiftTrainingArguments
 
 ROW = {"step": 0, "epoch": 0, "val_gce": 0.5} | {
@@ -47,7 +47,7 @@ RECORD = {
 
 def make(tmp_path, adapted, **changes):
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out", **changes)
-    record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
+    record = upload.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
     (tmp_path / "README.md").write_text(model_card.model_card(asdict(args), record))
     return ModelCard.load(tmp_path / "README.md")
 
@@ -198,7 +198,7 @@ def test_every_evaluation_keeps_its_own_metrics(tmp_path):
     depth = report_of(random_rows([2, 3], seed=1), reference="depth", unit="mm")
     booster = report_of(random_rows([2, 3], seed=2), booster=True)
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out")
-    record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
+    record = upload.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
     loaded = ModelCard(model_card.model_card(asdict(args), record, [proxy, depth, booster]))
     found = {}
     for result in loaded.data.eval_results:
@@ -219,7 +219,7 @@ def test_every_evaluation_keeps_its_own_metrics(tmp_path):
 def test_what_got_worse_stands_under_limits():
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out")
     adapted = ROW | {"val_tom_rmse": 0.2, "val_other_rmse": 0.3}
-    record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
+    record = upload.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
     limits = model_card.model_card(asdict(args), record).split("## Limits")[1]
     assert "Other RMSE on the validation groups got worse, by 20.0 %" in limits and "ToM RMSE" not in limits
     report = report_of(random_rows([2, 3]), collapse={"target_mean_ratio": 0.1, "spread_ratio": 1.0, "alarm": True})
@@ -290,7 +290,7 @@ def test_a_trained_folder_is_not_taken_for_the_backbone_it_is_named_after(base_d
     monkeypatch.chdir(tmp_path)
     (tmp_path / "vggt-1b").mkdir()
     args = GiftTrainingArguments("vggt-1b", "someone/gift-i", "out")
-    record = card.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
+    record = upload.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
     loaded = ModelCard(model_card.model_card(asdict(args), record))
     assert loaded.data.base_model is None and "paper" not in loaded.text
     with pytest.raises(ValueError, match="needs model_name_or_path"):

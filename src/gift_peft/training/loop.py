@@ -32,8 +32,9 @@ from gift_peft.models.identity import teacher_revision
 from gift_peft.models.loading import load_base
 from gift_peft.models.pixels import resolve_size
 from gift_peft.reports.model_card import model_card
-from gift_peft.training import card, checkpoints, validation
+from gift_peft.training import checkpoints, upload, validation
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
+from gift_peft.training.checkpoints import State, write_metrics
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
@@ -45,7 +46,6 @@ from gift_peft.training.start import (
     stop_signals,
     tell_lost_processes,
 )
-from gift_peft.training.state import State, write_metrics
 from gift_peft.training.teacher import make_proxies
 
 
@@ -354,13 +354,13 @@ class Run:
                 base = state.rows[0][key]
                 print(f"  {title:15}{number(base)} -> {number(row[key])} ({relative_change(base, row[key]):+.1f} %)")
         if self.args.push_to_hub:
-            print(f"Uploaded: https://huggingface.co/{card.push(adapter, self.args)}")
+            print(f"Uploaded: https://huggingface.co/{upload.push(adapter, self.args)}")
 
     def _save_adapter(self, folder: Path, state: State, with_card: bool = True) -> None:
         """The adapter as it is now, with the last row as its metrics. Only the main process writes."""
         if not self.accelerator.is_main_process:
             return
-        record = card.run_record(
+        record = upload.run_record(
             self.args,
             step=state.step,
             epoch=state.step / self.epoch_steps,

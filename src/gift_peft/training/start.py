@@ -20,8 +20,8 @@ from accelerate.utils import ProjectConfiguration, parse_flag_from_env
 
 from gift_peft.files import write_whole
 from gift_peft.training.arguments import GiftTrainingArguments
-from gift_peft.training.card import check_push
 from gift_peft.training.checkpoints import checkpoint_fault, find_checkpoint, list_checkpoints, remove_leftovers
+from gift_peft.training.upload import check_push
 
 RUN_FILES = ("config.yaml", "metrics.jsonl", "adapter", "adapter-last", "logs")
 

@@ -16,8 +16,8 @@ from gift_peft.losses import GeometryConsistencyError
 from gift_peft.training.start import Interrupted
 
 if TYPE_CHECKING:
+    from gift_peft.training.checkpoints import State
     from gift_peft.training.loop import Run
-    from gift_peft.training.state import State
 
 
 class UntilStopped(Sequence):

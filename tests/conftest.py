@@ -9,10 +9,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import datasets
 import pytest
 import torch
-from group_tools import DTYPES, gift_model
-from records import records
-from runs import arguments
-from tiny import tiny_model, write_base, write_raw_tree
+from helpers.group_tools import DTYPES, gift_model
+from helpers.records import records
+from helpers.runs import arguments
+from helpers.tiny import tiny_model, write_base, write_raw_tree
 
 from gift_peft.dataset.gift_i import register
 from gift_peft.dataset.writer import write_gift_i

@@ -6,7 +6,7 @@ import pytest
 import torch
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
-from group_tools import gift_model, gradients, group, largest_error
+from helpers.group_tools import gift_model, gradients, group, largest_error
 from torch import nn
 
 from gift_peft import group_step

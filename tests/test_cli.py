@@ -6,8 +6,8 @@ import sys
 
 import numpy as np
 import pytest
-from booster_tree import write_predictions, write_root
-from tiny import write_raw_tree
+from helpers.booster_tree import write_predictions, write_root
+from helpers.tiny import write_raw_tree
 
 from gift_peft import cli, evaluate_booster
 from gift_peft.evaluation.protocols import PROTOCOLS

@@ -7,7 +7,7 @@ import pytest
 import torch
 from accelerate import Accelerator, DistributedType
 from accelerate.state import AcceleratorState
-from group_tools import (
+from helpers.group_tools import (
     COUNTS,
     CUTS,
     DEAD,
@@ -22,8 +22,8 @@ from group_tools import (
     step_gradients,
     toy,
 )
+from helpers.tiny import tiny_model
 from peft import LoraConfig, get_peft_model
-from tiny import tiny_model
 from torch import nn
 
 from gift_peft.adapters.recipes import get_gift_model

@@ -6,7 +6,7 @@ import pytest
 import torch
 from accelerate import Accelerator, debug_launcher
 from accelerate.state import AcceleratorState, GradientState
-from group_tools import (
+from helpers.group_tools import (
     COUNTS,
     CUTS,
     DTYPES,
@@ -19,7 +19,7 @@ from group_tools import (
     step_gradients,
     toy,
 )
-from tiny import tiny_model, tiny_processor, write_raw_tree
+from helpers.tiny import tiny_model, tiny_processor, write_raw_tree
 
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.evaluation.on_gift_i import evaluate_gift_i

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.tiny import SIZE, tiny_model, tiny_processor, write_base
 from PIL import Image
-from tiny import SIZE, tiny_model, tiny_processor, write_base
 from transformers import DepthAnythingForDepthEstimation
 
 from gift_peft.adapters.folder import save_adapter

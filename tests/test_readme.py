@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
+from helpers.tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw_tree
 
 from gift_peft import get_gift_model, save_adapter
 from gift_peft.cli import main

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 import torch
-from group_tools import Toy, gradients, group, largest_error, toy
+from helpers.group_tools import Toy, gradients, group, largest_error, toy
 from torch import nn
 
 from gift_peft import memory

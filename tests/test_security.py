@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from datasets import Dataset, Image, List
+from helpers.runs import arguments
+from helpers.tiny import SIZE, tiny_processor, write_raw_tree
 from PIL import Image as PilImage
-from runs import arguments
-from tiny import SIZE, tiny_processor, write_raw_tree
 
 from gift_peft.adapters.folder import read_adapter_config, read_gift, save_adapter
 from gift_peft.adapters.recipes import get_gift_model

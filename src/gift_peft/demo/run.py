@@ -1,7 +1,7 @@
 """`gift-peft demo`: the paper on a laptop. Embedded base and groups, ordinary training, evaluation, table and picture.
 
 Everything goes through the code that real runs use; only the settings differ. The groups are rendered scenes with true
-depth, and the base was pre-trained on rooms without a mirror or glass (`examples/embedded/`).
+depth, and the base was pre-trained on rooms without a mirror or glass (`examples/tools/embedded/`).
 """
 
 import os

@@ -1,0 +1,60 @@
+"""The pictures and the card of the demo's report, as `model_cards/` shows them.
+
+    gift-peft demo --out DEMO --checkpoint_at_steps 636,1272
+    python examples/tools/embedded/report_pictures.py DEMO
+
+Runs `gift-peft report` on the demo (needs the extra `plots`), reduces its figures to 920 pixels and a palette and,
+where Chromium is installed, takes the first view of compare.html as well.
+"""
+
+import argparse
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+
+from gift_peft.demo.run import KINDS
+from gift_peft.reports.report import run_report
+
+CARDS = Path(__file__).parents[3] / "model_cards"
+FIGURES = {"before-after": "panels", "errors": "errors", "dynamics": "dynamics", "retention": "retention"}
+WIDTH = 920
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("demo", type=Path, help="folder of a demo that ended")
+    demo = parser.parse_args().demo
+    groups = [min((demo / "gift-i" / "validation").glob(f"{kind}_*")) for kind in KINDS]
+    pictures = [min((group / "images").iterdir()) for group in groups]
+    folder = run_report([demo], card=CARDS / "demo_adapter.md", zero_shot=pictures)
+    reduce(demo / "before_after.png", CARDS / "demo_before_after.png")
+    for name, target in FIGURES.items():
+        reduce(folder / f"{name}.png", CARDS / f"demo_{target}.png")
+    reduce(folder / f"zero-shot-{demo.resolve().name}.png", CARDS / "demo_zero_shot.png")
+    if browser := next(filter(None, map(shutil.which, BROWSERS)), None):
+        with tempfile.TemporaryDirectory() as temporary:
+            shot = Path(temporary) / "compare.png"
+            options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
+            options += ["--disable-background-networking", "--disable-component-update", "--window-size=1200,800"]
+            options += [f"--user-data-dir={temporary}/profile", f"--screenshot={shot}"]
+            subprocess.run([browser, *options, (folder / "compare.html").resolve().as_uri()], check=True)
+            reduce(shot, CARDS / "demo_compare.png")
+
+
+def reduce(source: Path, target: Path) -> None:
+    """At most WIDTH wide, 256 colours: a fifth of the size, and the colour map's steps stay invisible."""
+    image = Image.open(source).convert("RGB")
+    if image.width > WIDTH:
+        size = (WIDTH, round(image.height * WIDTH / image.width))
+        image = image.resize(size, Image.Resampling.LANCZOS)
+    palette = {"method": Image.Quantize.MAXCOVERAGE, "kmeans": 3, "dither": Image.Dither.NONE}  # keeps photos' colours
+    image.quantize(256, **palette).save(target, optimize=True)
+    print(f"{target}: {target.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""The demo on a three-group stand-in, and what the embedded assets promise."""
+
+import json
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.tiny import write_base
+from PIL import Image
+from transformers import AutoModelForDepthEstimation
+
+from gift_peft import load_gift_i
+from gift_peft.dataset.writer import write_gift_i
+from gift_peft.demo import run
+
+KINDS = ("mirror", "pane", "solid")
+
+
+def groups(split):
+    rng = np.random.default_rng(3)
+    for kind in KINDS:
+        mask = np.zeros((60, 75), bool)
+        mask[20:45, 20:50] = True
+        pictures = [Image.fromarray(rng.integers(0, 255, (60, 75, 3), dtype=np.uint8)) for _ in range(3)]
+        yield {
+            "split": split,
+            "group_id": f"{kind}_000",
+            "surface": "mirror" if kind == "mirror" else "transparent",
+            "images": pictures[:2],
+            "masks": [mask, mask],
+            "depths": [rng.integers(500, 5000, (60, 75)).astype(np.uint16)] * 2 if split == "validation" else [],
+            "reference": pictures[2] if split == "validation" else None,
+        }
+
+
+@pytest.fixture
+def embedded(tmp_path, monkeypatch):
+    root = tmp_path / "package"
+    write_base(root / "base")
+    for split in ("train", "validation"):
+        write_gift_i(groups(split), root / "gift-i", license="apache-2.0")
+    monkeypatch.setattr(run, "files", lambda package: root)
+    return root
+
+
+def test_demo_leaves_everything_it_promises(embedded, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    reports = run.run_demo("demo", extra=["--num_train_epochs=1", "--retain=2"])
+    assert set(reports) == {"proxy", "depth"}
+    printed = capsys.readouterr().out
+    assert "Against true depth" in printed and "demo/before_after.png" in printed
+    assert "\x1b[" not in printed  # not a terminal
+    with Image.open("demo/before_after.png") as picture:
+        assert picture.width > 1000
+    text = Path("demo/report.md").read_text()
+    assert all(label in text for label in run.KINDS.values()) and "consensus" in text.lower()
+    # The adapter names its base by the path demo/base.
+    assert json.loads(Path("demo/adapter/adapter_config.json").read_text())["base_model_name_or_path"] == "demo/base"
+    model = AutoModelForDepthEstimation.from_pretrained("demo/adapter").eval()
+    assert torch.isfinite(model(torch.zeros(1, 3, 112, 140)).predicted_depth).all()
+
+    with pytest.raises(ValueError, match=r"demo already holds a run; --overwrite_output_dir"):
+        run.run_demo("demo")
+    assert "channels_last: true" in Path("demo/config.yaml").read_text()
+    run.run_demo("demo", overwrite_output_dir=True, seed=1, extra=["--max_steps=1", "--head=lora"])
+    assert len(Path("demo/metrics.jsonl").read_text().splitlines()) == 2
+    assert "1 updates" in Path("demo/report.md").read_text() and "1 epochs" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "channels_last"),
+    [
+        ([], True),
+        (["--head=lora"], False),
+        (["--channels_last=false"], False),
+        (["--channels-last", "false"], False),
+        (["--head=lora", "--channels_last"], True),  # refused by the training, which says why
+    ],
+)
+def test_the_demo_is_channels_last_where_it_can_and_may_be(embedded, tmp_path, monkeypatch, options, channels_last):
+    asked = []
+
+    def stop(args):
+        asked.append(args)
+        raise InterruptedError
+
+    monkeypatch.setattr(run, "train", stop)
+    with pytest.raises(InterruptedError):
+        run.run_demo(tmp_path / "demo", extra=options)
+    assert asked[0].channels_last is channels_last
+
+
+@pytest.mark.parametrize("argument", ["--output_dir=x", "--dataset_name=mine", "--model_name_or_path=x/base"])
+def test_what_the_demo_brings_itself_is_not_replaced(embedded, tmp_path, argument):
+    name = argument[2:].split("=")[0]
+    with pytest.raises(ValueError, match=f"{name}: the demo has its own"):
+        run.run_demo(tmp_path / "demo", extra=[argument])
+    assert not (tmp_path / "demo").exists()
+
+
+def test_a_package_without_its_assets_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "files", lambda package: tmp_path / "nothing")
+    with pytest.raises(FileNotFoundError, match="lacks gift_peft/demo/base"):
+        run.run_demo(tmp_path / "demo")
+
+
+def test_embedded_assets_keep_their_promises():
+    root = Path(str(files("gift_peft.demo")))
+    paths = [path for name in ("base", "gift-i") for path in (root / name).rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in paths) < 16e6
+    train, validation = (load_gift_i(root / "gift-i", split) for split in ("train", "validation"))
+    kinds = [row.split("_")[0] for row in train["group_id"]]
+    assert [kinds.count(kind) for kind in KINDS] == [106, 106, 106]
+    kinds = [row.split("_")[0] for row in validation["group_id"]]
+    assert [kinds.count(kind) for kind in KINDS] == [8, 8, 8]
+    assert not any(train["depths"]) and not any(train["reference"])  # the demo cannot look at them
+    for row in validation:
+        assert len(row["depths"]) == len(row["images"]) == len(row["masks"]) and row["reference"] is not None
+        depth = np.asarray(row["depths"])
+        assert 250 < depth.min() < depth.max() < 30_000
+    model = AutoModelForDepthEstimation.from_pretrained(root / "base")
+    assert model.config.depth_estimation_type == "relative"
+    assert {p.dtype for p in model.parameters()} == {torch.float32}

@@ -1,0 +1,144 @@
+"""The before/after picture, pixel by pixel where it matters; error maps; PDFs."""
+
+import builtins
+
+import numpy as np
+import pytest
+from helpers.reports import panel
+from PIL import Image, ImageDraw
+
+from gift_peft.colormap import GREY, colorize_error
+from gift_peft.reports.figures import (
+    CAPTION,
+    GAP,
+    HEADER,
+    TILE_WIDTH,
+    align_panel,
+    before_after,
+    error_maps,
+    error_row,
+    panel_row,
+    prediction_row,
+    save_grid,
+)
+
+
+def tiles(picture: Image.Image, row=0, size=(60, 75)) -> list[np.ndarray]:
+    height = round(TILE_WIDTH * size[0] / size[1])
+    top = HEADER + row * (CAPTION + height + GAP) + CAPTION
+    pixels = np.asarray(picture)
+    return [
+        pixels[top : top + height, left : left + TILE_WIDTH]
+        for left in (GAP + index * (TILE_WIDTH + GAP) for index in range(4))
+    ]
+
+
+@pytest.mark.parametrize("kind", ["depth", "inverse_depth"])
+def test_before_after_shows_one_range_and_unknown_in_the_reference_only(tmp_path, kind):
+    path = before_after([panel(kind=kind), panel(1, kind=kind)], tmp_path / "figure.png")
+    picture = Image.open(path)
+    assert picture.size == (GAP + 4 * (TILE_WIDTH + GAP), HEADER + 2 * (CAPTION + 288 + GAP))
+    for row in range(2):
+        rgb, reference, base, adapted = tiles(picture, row)
+        grey = [(tile[5:40, 5:40] == GREY).all(-1).all() for tile in (rgb, reference, base, adapted)]
+        assert grey == [False, True, False, False]
+        known = np.s_[60:]  # below the unknown corner; a perfect prediction looks like its reference
+        difference = np.abs(reference[known].astype(int) - adapted[known])
+        assert np.quantile(difference, 0.99) <= 3
+        inside = np.s_[90:200, 115:220]
+        assert np.abs(reference[inside].astype(int) - base[inside]).mean() > 15
+
+
+def test_before_after_outlines_the_target(tmp_path):
+    rows = tiles(Image.open(before_after([panel()], tmp_path / "figure.png")))
+    middle, left = 144, round(20 * TILE_WIDTH / 75)
+    for tile in rows:
+        assert (tile[middle, left : left + 1] == 255).all() and (tile[middle, left - 1] == 0).all()
+
+
+def test_before_after_refuses_what_it_cannot_draw(tmp_path):
+    with pytest.raises(ValueError, match="at least one panel"):
+        before_after([], tmp_path / "x.png")
+    with pytest.raises(ValueError, match="shapes must agree"):
+        before_after([panel(base=np.ones((3, 4)))], tmp_path / "x.png")
+    assert not list(tmp_path.iterdir())
+
+
+def test_before_after_says_where_the_target_has_no_reference(tmp_path, monkeypatch):
+    captions = []
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda self, at, text, **_: captions.append(text))
+    blind = panel()
+    blind.reference[blind.target] = 0
+    before_after([panel(), blind], tmp_path / "figure.png")
+    assert "mm before, " in captions[0] and "RMSE in the outline: unknown" in captions[1]
+
+
+@pytest.mark.parametrize("kind", ["depth", "inverse_depth"])
+def test_error_maps_are_errors_after_alignment(kind):
+    own = panel(kind=kind)
+    aligned = align_panel(own)
+    row = error_row(own)
+    base, adapted = row.tiles[1:]
+    assert (base[5:8, 5:8] == GREY).all() and (adapted[5:8, 5:8] == GREY).all()
+    # A perfect prediction has the darkest colour of the map everywhere, where something is known.
+    zero = colorize_error(np.zeros((1, 1)), 1)[0, 0]
+    assert (adapted[20:40, 25:45] == zero).all()
+    # The base's error is monotonous in the brightness of its map.
+    error = np.abs(aligned.base - own.reference)[own.target]
+    brightness = base[own.target].astype(int).sum(-1)
+    order = np.argsort(error)
+    assert (np.diff(brightness[order]) >= -12).all() and brightness.max() > brightness.min() + 100
+    expected = np.sqrt(np.mean((aligned.base - own.reference)[own.target] ** 2))
+    assert f"{expected:.0f} mm before, 0 mm after" in row.caption
+
+
+def test_pixels_that_do_not_count_neither_fit_nor_score():
+    own = panel()
+    spoiled = panel()
+    spoiled.reference[15:30, 20:50] = 9000
+    spoiled.valid = np.ones(own.reference.shape, bool)
+    spoiled.valid[15:30, 20:50] = False
+    aligned = align_panel(spoiled)
+    assert aligned.errors[1] == pytest.approx(0, abs=1e-6)
+    assert np.isnan(aligned.reference[20, 30]) and np.isfinite(aligned.adapted[20, 30])
+    np.testing.assert_allclose(aligned.adapted, align_panel(own).adapted)
+
+
+def test_predictions_of_one_picture_share_their_colours():
+    image = Image.new("RGB", (40, 30))
+    near, far = np.full((30, 40), 2.0), np.full((30, 40), 1.0)
+    row = prediction_row("photo.jpg", image, [near, far, near], "inverse_depth")
+    assert [tile.shape for tile in row.tiles] == [(30, 40, 3)] * 4
+    assert (row.tiles[1] == row.tiles[3]).all() and row.tiles[1].sum() > row.tiles[2].sum()
+    flipped = prediction_row("photo.jpg", image, [near, far], "depth")
+    assert flipped.tiles[1].sum() < flipped.tiles[2].sum()
+
+
+def test_pdf_holds_text_and_tiles_and_is_the_same_every_time(tmp_path):
+    pytest.importorskip("matplotlib")
+    first = before_after([panel(), panel(1)], tmp_path / "a.pdf").read_bytes()
+    second = before_after([panel(), panel(1)], tmp_path / "b.pdf").read_bytes()
+    assert first[:5] == b"%PDF-" and first == second
+    assert first.count(b"/Subtype /Image") == 2 * 4
+    assert error_maps([panel()], tmp_path / "c.pdf").read_bytes().count(b"/Subtype /Image") == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pdf", "b.pdf", "c.pdf"]
+
+
+def test_png_needs_no_matplotlib_and_pdf_says_what_to_install(tmp_path, monkeypatch):
+    original = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.split(".")[0] == "matplotlib":
+            raise ModuleNotFoundError(name)
+        return original(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    before_after([panel()], tmp_path / "a.png")
+    with pytest.raises(ImportError, match=r"pip install gift-peft\[plots\]"):
+        before_after([panel()], tmp_path / "a.pdf")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_other_suffixes_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"x\.svg: a figure is \.png or \.pdf"):
+        save_grid([panel_row(panel())], ("a", "b", "c", "d"), tmp_path / "x.svg")

@@ -189,13 +189,13 @@ def test_an_adapter_for_other_shapes_or_layers_is_refused(adapter_dir, base_dir,
 
 
 def test_an_adapter_of_another_hub_id_is_refused(adapter_dir, base_dir, tmp_path, monkeypatch):
-    from gift_peft import predict
+    from gift_peft.models import loading
 
     hub = shutil.copytree(adapter_dir, tmp_path / "hub")
     config = json.loads((hub / "adapter_config.json").read_text())
     (hub / "adapter_config.json").write_text(json.dumps(config | {"base_model_name_or_path": "org/model-a"}))
     (hub / "gift.json").write_text(json.dumps({"base_revision": "0123abc"}))
-    monkeypatch.setattr(predict, "teacher_revision", lambda base, revision: "4567def")
+    monkeypatch.setattr(loading, "teacher_revision", lambda base, revision: "4567def")
     with pytest.raises(ValueError, match=r"was trained on org/model-a, not on base org/model-b"):
         predict._check_base("org/model-b", None, hub, "org/model-a")
     predict._check_base("org/model-a", None, hub, "org/model-a")

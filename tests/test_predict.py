@@ -197,8 +197,8 @@ def test_an_adapter_of_another_hub_id_is_refused(adapter_dir, base_dir, tmp_path
     (hub / "gift.json").write_text(json.dumps({"base_revision": "0123abc"}))
     monkeypatch.setattr(loading, "teacher_revision", lambda base, revision: "4567def")
     with pytest.raises(ValueError, match=r"was trained on org/model-a, not on base org/model-b"):
-        predict._check_base("org/model-b", None, hub, "org/model-a")
-    predict._check_base("org/model-a", None, hub, "org/model-a")
+        loading._check_base("org/model-b", None, hub, "org/model-a")
+    loading._check_base("org/model-a", None, hub, "org/model-a")
     monkeypatch.undo()
     assert load_model(base_dir, hub).size == SIZE  # a local copy of the hub's model
 

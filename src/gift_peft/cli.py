@@ -183,7 +183,7 @@ def _proxies(args: argparse.Namespace, rest: list[str]) -> int:
 
 
 def _prepare(args: argparse.Namespace, rest: list[str]) -> int:
-    from gift_peft.prepare.prepare import run
+    from gift_peft.prepare.prepare_verb import run
 
     return run(rest)
 

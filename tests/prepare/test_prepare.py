@@ -17,7 +17,8 @@ from PIL import Image
 from gift_peft.cli import main
 from gift_peft.dataset.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.prepare.prepare import prepare_gift_i
-from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings, parse_arguments
+from gift_peft.prepare.prepare_verb import parse_arguments
+from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
 
 SIZE = (160, 200)
 

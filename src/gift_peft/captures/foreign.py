@@ -25,10 +25,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-import yaml
-
 from gift_peft.captures.masks import MaskSource
 from gift_peft.captures.tree import Capture
+from gift_peft.files import read_yaml
 from gift_peft.images import is_image_file, natural_key
 from gift_peft.rules import SPLITS
 
@@ -127,17 +126,11 @@ class Layout:
 def read_layout(path: str | Path) -> Layout:
     """The layout file; FileNotFoundError or ValueError naming it and the key."""
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"layout: no such file: {path}")
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"layout {path}: not valid YAML ({' '.join(str(error).split())})") from None
+    values = read_yaml(path, f"layout {path}")
     known = Layout.__dataclass_fields__
-    unknown = [f"unknown key {key!r}; " for key in values if key not in known] if isinstance(values, dict) else [""]
-    if unknown:
-        raise ValueError(f"layout {path}: {unknown[0]}it may have the keys {', '.join(known)} and no others")
     for key, value in values.items():
+        if key not in known:
+            raise ValueError(f"layout {path}: unknown key {key!r}; it may have the keys {', '.join(known)}")
         if key in ("splits", "lists"):
             right = isinstance(value, dict) and set(value) <= set(SPLITS) and all(map(_is_text, value.values()))
         elif key == "columns":

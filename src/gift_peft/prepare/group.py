@@ -24,7 +24,8 @@ from gift_peft.prepare.settings import QualitySettings, RegistrationSettings
 from gift_peft.rules import check_count, check_group_id
 
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything
-ABOUT_REFERENCE = ("too_dark", "too_bright", "another_scene", "outside_change")  # its target differs by design
+# Remarks that count for a treated reference; inside the target it differs by design.
+ABOUT_REFERENCE = ("too_dark", "too_bright", "another_scene", "outside_change")
 
 
 class Rejection(Exception):
@@ -228,33 +229,19 @@ def check(photos: list[Photo], reference: Photo | None, job: Job, entry: GroupEn
         photo.entry.warnings += warnings
         if reasons:
             photo.entry.drop(reasons)
-    if reference is not None:
-        if not reference.dropped:
-            check_reference(reference, photos[-1], smalls[-1], settings)
-        if reference.dropped:
-            text = "; ".join(item.text for item in reference.entry.reasons)
-            entry.warnings.append(Remark("reference_dropped", f"the treated reference is dropped: {text}"))
+    if reference is not None and not reference.dropped:
+        check_reference(reference, photos[-1], smalls[-1], settings)
     left = [index for index, photo in enumerate(there) if not photo.dropped]
     areas = [smalls[index].mask_area for index in left]
     most, complaint = check_group_change(changes[np.ix_(left, left)], settings)
-    ious = [photo.entry.quality.mask_iou for photo in there if photo.entry.quality.mask_iou is not None]
+    measured = [photo.entry.quality for photo in there]
     entry.quality = GroupQuality(
         target_change=most,
         mask_area=float(np.mean(areas)) if areas else None,
-        outside_change=max(photo.entry.quality.outside_change or 0.0 for photo in there),
-        mask_iou=min(ious, default=None),
+        outside_change=max(figures.outside_change or 0.0 for figures in measured),
+        mask_iou=min((figures.mask_iou for figures in measured if figures.mask_iou is not None), default=None),
     )
-    try:
-        check_count(job.group_id, len(left), job.split, reference is not None and not reference.dropped)
-    except ValueError:
-        dropped = "; ".join(
-            f"{frame.name}: {', '.join(item.text for item in frame.reasons)}"
-            for frame in entry.frames
-            if frame.status == "dropped"
-        )
-        count = sum(frame.role == "observation" for frame in entry.frames)
-        text = f"{len(left)} of {count} observations are left; dropped are {dropped}"
-        raise Rejection("too_few_frames", text) from None
+    check_left(len(left), reference, job, entry)
     if complaint is not None and job.split == "train":
         raise Rejection("target_unchanged", complaint)
     if complaint is not None:
@@ -273,6 +260,21 @@ def check_reference(reference: Photo, last: Photo, target: SmallFrame, settings:
     reference.entry.warnings += [item for item in warnings[0] if item.code in ABOUT_REFERENCE]
     if bad := [item for item in reasons[0] if item.code in ABOUT_REFERENCE]:
         reference.entry.drop(bad)
+
+
+def check_left(count: int, reference: Photo | None, job: Job, entry: GroupEntry) -> None:
+    """Whether `count` observations are enough, with or without the treated reference."""
+    if reference is not None and reference.dropped:
+        text = "; ".join(item.text for item in reference.entry.reasons)
+        entry.warnings.append(Remark("reference_dropped", f"the treated reference is dropped: {text}"))
+    try:
+        check_count(job.group_id, count, job.split, reference is not None and not reference.dropped)
+    except ValueError:
+        frames = [frame for frame in entry.frames if frame.status == "dropped"]
+        dropped = "; ".join(f"{frame.name}: {', '.join(item.text for item in frame.reasons)}" for frame in frames)
+        taken = sum(frame.role == "observation" for frame in entry.frames)
+        text = f"{count} of {taken} observations are left; dropped are {dropped}"
+        raise Rejection("too_few_frames", text) from None
 
 
 def write(photos: list[Photo], reference: Photo | None, surface: str | None, job: Job) -> dict:

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-MAX_PIXELS = 40_000  # of a picture that take part in a fit; more make it slower, not surer
+MAX_PIXELS = 40_000  # of a picture that take part in a fit; more make it slower, not more exact
 MIN_PIXELS = 300
 MAX_STEPS = 25
 SETTLED = 0.005  # pixels
 GROSS = 2.0  # pixels, the paper's reprojection threshold
-TUKEY = 4.685  # in standard deviations: 95 % efficient on Gaussian residuals, deaf to everything far beyond
+TUKEY = 4.685  # in standard deviations: 95 % efficient on Gaussian residuals, and ignores what lies far beyond
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,8 @@ def fit_points(fixed: np.ndarray, moving: np.ndarray, start: np.ndarray, size: t
         matrix = matrix + np.append(step, 0.0).reshape(3, 3)
         if np.abs(step).max() < 1e-9:
             break
-    # For the covariance every match counts that is no gross outlier: a few dozen of which half agree closely look
-    # surer than they are.
+    # For the covariance every match counts that is no gross outlier. With a few dozen matches, the half that agrees
+    # best would promise too small an error.
     near = distance[distance < GROSS * frame[0, 0]]
     honest = max(float(np.sqrt(np.square(near).sum() / max(2 * len(near) - 8, 1))), sigma)
     return Fit(_in_pixels(matrix, frame), np.linalg.inv(normal) * honest**2, frame, honest / frame[0, 0])

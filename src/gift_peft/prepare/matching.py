@@ -1,7 +1,7 @@
 """The paper's matching between two frames: SIFT, ratio test, displacement filter, MAGSAC (supplement A).
 
-What it adds: features only outside the target where asked, one match per feature, and a least-squares fit to all
-matches that agree, whose covariance says how well they fix the map at the target's corners.
+Added to it: on request only features outside the target, with one match per feature; and a least-squares fit to all
+matches that agree. Its covariance says how exact the map is at the target's corners.
 """
 
 from dataclasses import dataclass

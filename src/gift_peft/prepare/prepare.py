@@ -8,8 +8,7 @@ import json
 import os
 import platform
 import shutil
-import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 
+import cv2
 import numpy as np
 from filelock import FileLock, Timeout
 from tqdm import tqdm
@@ -26,35 +26,13 @@ from gift_peft.captures.tree import find_groups
 from gift_peft.dataset.writer import write_card, write_rows
 from gift_peft.files import write_whole
 from gift_peft.prepare.entries import Statistics
+from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import FORMAT, Job, Outcome
-from gift_peft.prepare.settings import PrepareSettings, parse_arguments
+from gift_peft.prepare.page import write_html
+from gift_peft.prepare.settings import PrepareSettings
 from gift_peft.rules import SPLITS
 
 STATE = ".prepare"  # in OUT: one record per finished group, and groups on their way
-
-
-def run(argv: Sequence[str]) -> int:
-    """The verb `gift-peft prepare`: prepare, say in a few lines what came of it, and return the exit code.
-
-    Raises ValueError or an OSError (one line each) where nothing could be made; a wrong command line ends the program.
-    """
-    args = parse_arguments(argv)
-    report = prepare_gift_i(**vars(args))
-    for entry in report["groups"]:
-        if entry["status"] == "rejected":
-            text = entry["reasons"][0]["text"]
-            print(f"gift-peft: rejected: {entry['split']}/{entry['group_id']}: {text}", file=sys.stderr)
-    for split, found in report["statistics"].items():
-        print(
-            f"{split}: {found['groups']} groups, {found['images']} images ({found['warped_frames']} frames warped, "
-            f"{found['dropped_frames']} dropped), {found['references']} references, "
-            f"{found['rejected_groups']} groups rejected"
-        )
-    print(f"Report: {args.out / 'report.html'}")
-    kept = sum(found["groups"] for found in report["statistics"].values())
-    if not kept:
-        raise ValueError(f"no group could be prepared; {args.out / 'report.html'} says why")
-    return 0 if kept == len(report["groups"]) else 3
 
 
 def prepare_gift_i(
@@ -103,8 +81,6 @@ def prepare_gift_i(
             for name in ("README.md", "groups.jsonl"):
                 (out / name).unlink(missing_ok=True)
         write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False))
-        from gift_peft.prepare.page import write_html
-
         write_html(out, report)
     return report
 
@@ -168,10 +144,6 @@ def _check_names(jobs: list[Job]) -> None:
 
 def _run(jobs: list[Job], num_proc: int) -> Iterator[tuple[Job, Outcome]]:
     """Every job with its outcome, as they finish."""
-    import cv2
-
-    from gift_peft.prepare.group import prepare_group
-
     if num_proc == 1 or len(jobs) < 2:
         threads = cv2.getNumThreads()
         try:
@@ -208,7 +180,7 @@ def _places(root: Path, split: str, group_id: str) -> tuple[Path, Path]:
 
 
 def _read_record(out: Path, job: Job) -> dict | None:
-    """What an earlier run noted about a group, if everything it made is still there."""
+    """What an earlier run noted about a group; None if a file that it made is missing or has another size."""
     path = _record_path(out, job.split, job.group_id)
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
@@ -221,7 +193,7 @@ def _read_record(out: Path, job: Job) -> dict | None:
 
 
 def _write_record(out: Path, job: Job, outcome: Outcome) -> dict:
-    """Last of all steps of a group: only what has a record is finished."""
+    """The last step of a group: only a group with a record counts as finished."""
     files = {
         path.relative_to(out).as_posix(): path.stat().st_size
         for place in _places(out, job.split, job.group_id)
@@ -247,11 +219,11 @@ def _install(out: Path, job: Job, outcome: Outcome) -> None:
 
 
 def _remove_others(out: Path, wanted: Collection[tuple[str, str]]) -> list[str]:
-    """Take out of OUT what earlier runs made of groups that are gone from RAW; which these were."""
+    """Remove what earlier runs made of groups that RAW no longer has, and return the names of these groups."""
     records = [(split, path.stem) for split in SPLITS for path in sorted((out / STATE / split).glob("*.json"))]
     gone = [key for key in records if key not in wanted]
     if gone:
-        # Tables first, as everywhere; the caller writes the new ones.
+        # First the tables, so that they never name a group that is not there; the caller writes the new ones.
         for split in SPLITS:
             (out / split / "metadata.parquet").unlink(missing_ok=True)
     for key in gone:
@@ -274,8 +246,6 @@ def _rows(kept: dict[tuple[str, str], dict], jobs: list[Job]) -> dict[str, dict[
 
 
 def _report(raw: Path, out: Path, settings: PrepareSettings, entries: list[dict], removed: list[str]) -> dict:
-    import cv2
-
     splits = {split: [entry for entry in entries if entry["split"] == split] for split in SPLITS}
     return {
         "format": FORMAT,

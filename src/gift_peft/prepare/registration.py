@@ -85,8 +85,8 @@ def _decide(match: Matches, moving: Frame, fixed: Frame, treated: bool) -> Regis
         difference_before=before,
         difference_after=after,
     )
-    # A turn about a point among the features moves them little and a target far from it much. That is believed only
-    # when the pixels bear it out: the map alone moves corners of frames whose camera stood still.
+    # A turn about a point among the features moves them little, but a target far from them much. It is believed only
+    # if the pixels confirm it, because the map alone would also move corners of frames whose camera stood still.
     hidden = moved - 2 * error > settings.identity_displacement and after < 0.97 * before
     if match.median_displacement < settings.identity_displacement and not hidden:
         return Registration("identity", np.eye(3), figures)
@@ -226,8 +226,8 @@ def _diagnose(tries: list[Matches], fixed: Frame) -> list[Remark]:
 def _refine(match: Matches, moving: Frame, fixed: Frame) -> tuple[Fit, float]:
     """The better of the fits to the matches and, from there, to the pixels, and its error at the target's corners.
 
-    The pixels are taken where they are surer and the matches bear them out. Where they say something else, the two
-    disagree by more than either admits, and that is the error.
+    The pixels' fit is taken where its expected error is smaller and the matches agree with it. Otherwise the matches'
+    is, and the distance between the two fits counts as its error if that is larger.
     """
     by_points, by_pixels = match.fit, fit_pixels(fixed.levels, moving.levels, match.fit.matrix)
     error = by_points.expected_error(fixed.corners)

@@ -1,31 +1,18 @@
-"""The settings of `gift-peft prepare`. The dataclasses are its options: every field with a text below is one.
+"""The settings of `gift-peft prepare`. Every field with a text is a command line option (`prepare_verb.py`)."""
 
-A YAML file (`--config`) may state the same names, and the command line wins.
-"""
-
-import argparse
-import difflib
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
-from pathlib import Path
+from dataclasses import dataclass, field
 
-import yaml
-
-from gift_peft.captures.foreign import Layout, read_layout
-
-DESCRIPTION = "From a folder of photos to a checked GIFT-I dataset: register, check, write, report."
-EPILOG = """X is a number of at least 0. --no-static-rig (and so on) turns off a flag that the --config file turns on.
-
-Example: gift-peft prepare my-captures gift-i --num-proc 2
-
-Exit code: 0 if every group is in OUT, 3 if some were rejected (the report says why), 1 if none could be made, or RAW
-or a configuration file is wrong, 2 for a wrong command line. Run again, it does what is left to do."""
+from gift_peft.captures.foreign import Layout
 
 
-def _arg(text: str, default, metavar: str = "X", least: int = 0):
-    """A field that is an option; `least` holds for numbers."""
-    return field(default=default, metadata={"help": text, "metavar": metavar, "least": least})
+def option(text: str, metavar: str = "X", least: int = 0) -> dict:
+    """The metadata of a field that is an option; `least` is the smallest number that it takes."""
+    return {"help": text, "metavar": metavar, "least": least}
+
+
+def _arg(text: str, default, **more):
+    return field(default=default, metadata=option(text, **more))
 
 
 @dataclass(frozen=True)
@@ -101,130 +88,7 @@ class PrepareSettings:
         "propose masks for groups that lack any, into OUT/masks_proposed; they are not used", False
     )
     accept_proposed_masks: bool = _arg("use the proposed masks, which the dataset card then says", False)
-    refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, "sam2:MODEL")
+    refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
     layout: Layout | None = field(
-        default=None,
-        metadata={"help": "YAML file that says where RGB and mask files lie", "metavar": "FILE", "least": 0},
+        default=None, metadata=option("YAML file that says where RGB and mask files lie", metavar="FILE")
     )
-
-
-@dataclass
-class PrepareArguments:
-    """The arguments of `prepare_gift_i`, as the command line states them."""
-
-    raw: Path
-    out: Path
-    settings: PrepareSettings
-    num_proc: int = _arg("processes, each with groups of its own", 1, "N", least=1)
-    license: str = _arg("for the dataset card, for example cc-by-4.0", "unknown", "ID")
-    pretty_name: str | None = _arg("for the dataset card; default: the name of RAW", None, "NAME")
-
-
-PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
-
-
-def _options(kind: type) -> dict:
-    return {f.name: f for f in fields(kind) if f.metadata}
-
-
-def parse_arguments(argv: Sequence[str]) -> PrepareArguments:
-    """The command line `argv` (without the verb) over the YAML file of `--config` over the defaults.
-
-    A wrong command line ends as argparse does it (exit code 2). Raises ValueError or FileNotFoundError naming the
-    YAML file and its key.
-    """
-    parser = _parser()
-    given = parser.parse_args(argv)
-    if given.config is not None:
-        given = parser.parse_args([*_read_config(Path(given.config)), *argv])
-    parts = {name: kind(**{key: getattr(given, key) for key in _options(kind)}) for name, kind in PARTS.items()}
-    choices = {key: getattr(given, key) for key in _options(PrepareSettings)}
-    choices["propose_masks"] |= given.accept_proposed_masks or given.refine is not None
-    choices["layout"] = None if given.layout is None else read_layout(given.layout)
-    more = {key: getattr(given, key) for key in _options(PrepareArguments)}
-    return PrepareArguments(Path(given.raw), Path(given.out), PrepareSettings(**parts, **choices), **more)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="gift-peft prepare",
-        usage="%(prog)s RAW OUT [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    parser.add_argument("raw", metavar="RAW", help="folder of group folders; it is only read")
-    parser.add_argument("out", metavar="OUT", help="prepared folder: new, or made by this command before")
-    parser.add_argument("--config", metavar="FILE", help="YAML file with values for the options below")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    for kind in (PrepareArguments, PrepareSettings, *PARTS.values()):
-        group = parser if kind not in PARTS.values() else parser.add_argument_group(*kind.__doc__.split(". ", 1))
-        for option in _options(kind).values():
-            _add(group, option)
-    return parser
-
-
-def _add(parser, option) -> None:
-    """An option under both spellings, --num-proc and --num_proc; the help shows the first."""
-    text, metavar, least = option.metadata["help"], option.metadata["metavar"], option.metadata["least"]
-    kind = type(option.default)
-    if kind is bool:
-        forms = [(option.name, {"action": "store_true"}), (f"no_{option.name}", {"action": "store_false"})]
-    elif kind in (int, float):
-        text += f" (default: {option.default:g})"
-        forms = [(option.name, {"type": _number(kind, least), "metavar": metavar})]
-    else:
-        forms = [(option.name, {"metavar": metavar})]
-    for name, form in forms:
-        for spelling in dict.fromkeys((name.replace("_", "-"), name)):
-            shown = text if spelling == option.name.replace("_", "-") else argparse.SUPPRESS
-            parser.add_argument(f"--{spelling}", dest=option.name, default=option.default, help=shown, **form)
-
-
-def _number(kind: type, least: int):
-    def parse(text: str):
-        try:
-            value = kind(text)
-        except ValueError:
-            value = math.nan
-        if not least <= value < math.inf:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a {kind.__name__} of at least {least}")
-        return value
-
-    return parse
-
-
-def _read_config(path: Path) -> list[str]:
-    """The file's values as words of a command line, checked by the same parser."""
-    if not path.is_file():
-        raise FileNotFoundError(f"config: no such file: {path}")
-
-    def refuse(message: str):
-        raise ValueError(f"config {path}: {message}")
-
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        refuse(f"not valid YAML: {' '.join(str(error).split())}")
-    if not isinstance(values, dict):
-        refuse("expected lines of the form `key: value`")
-    known = {
-        key: f for kind in (PrepareArguments, PrepareSettings, *PARTS.values()) for key, f in _options(kind).items()
-    }
-    words = []
-    for key, value in values.items():
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            refuse(f"unknown key {key!r}" + (f"; did you mean {near[0]}?" if near else ""))
-        flag = isinstance(known[key].default, bool)
-        if isinstance(value, list | dict) or flag != isinstance(value, bool):
-            refuse(f"{key}: {value!r}; expected {'true or false' if flag else 'one value'}")
-        if flag:
-            words.append(f"--{key}" if value else f"--no_{key}")
-        elif value is not None:
-            words.append(f"--{key}={value}")
-    parser = _parser()
-    parser.error = refuse
-    parser.parse_args(["RAW", "OUT", *words])
-    return words

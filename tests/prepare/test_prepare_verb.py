@@ -1,6 +1,8 @@
-"""The options of `gift-peft prepare`: read off the dataclasses, in both spellings, with defaults, light to ask for."""
+"""The options of `gift-peft prepare`: every field of the settings, in both spellings; help loads nothing heavy."""
 
 import ast
+import inspect
+import re
 import subprocess
 import sys
 from dataclasses import fields
@@ -10,8 +12,9 @@ from pathlib import Path
 import pytest
 
 import gift_peft.prepare
-from gift_peft.prepare.settings import PrepareArguments, PrepareSettings, QualitySettings, RegistrationSettings
-from gift_peft.prepare.settings import parse_arguments as parse
+from gift_peft.prepare.prepare import prepare_gift_i
+from gift_peft.prepare.prepare_verb import parse_arguments as parse
+from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
 
 PACKAGE = Path(gift_peft.prepare.__file__).parent
 THRESHOLDS = [(part, f) for part in (RegistrationSettings, QualitySettings) for f in fields(part)]
@@ -39,23 +42,19 @@ def test_every_field_is_an_option_in_both_spellings(tmp_path, spell):
     layout.write_text("root: release")
     args = parse(["R", "O", f"--{spell('pretty_name')}=A b", "--layout", str(layout), "--refine", "sam2:x"])
     assert args.pretty_name == "A b" and args.settings.layout.root == "release" and args.settings.propose_masks
-    assert set(vars(args)) == {f.name for f in fields(PrepareArguments)}
+    assert set(vars(args)) <= inspect.signature(prepare_gift_i).parameters.keys()
 
 
 def test_help_says_every_option_its_default_and_an_example(capsys):
     with pytest.raises(SystemExit) as ended:
         parse(["--help"])
     words = " ".join(capsys.readouterr().out.split())
-    assert (
-        ended.value.code == 0
-        and "Example: gift-peft prepare" in words
-        and "_rig" not in words.replace("static_rig: true", "")
-    )
+    assert ended.value.code == 0 and "example: gift-peft prepare" in words and "--static_rig" not in words
     for _, f in THRESHOLDS:
         assert f.metadata["help"] in words
-        assert f"--{f.name.replace('_', '-')} " in words
+        assert re.search(rf"--{f.name.replace('_', '-')}[ ,]", words)
         if not isinstance(f.default, bool):
-            assert f"{f.metadata['help']} (default: {f.default:g})" in words
+            assert f"{f.metadata['help']} (default: {f.default})" in words
 
 
 def test_help_imports_nothing_heavy():
@@ -65,7 +64,7 @@ import resource, sys, types
 package = types.ModuleType("gift_peft")
 package.__path__ = [{str(PACKAGE.parent)!r}]
 sys.modules["gift_peft"] = package
-from gift_peft.prepare.prepare import run
+from gift_peft.prepare.prepare_verb import run
 try:
     run(["--help"])
 except SystemExit:

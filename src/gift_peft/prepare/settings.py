@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from gift_peft.captures.foreign import Layout
 
 
-def option(text: str, metavar: str = "X", least: int = 0) -> dict:
+def _option(text: str, metavar: str = "X", least: int = 0) -> dict:
     """The metadata of a field that is an option; `least` is the smallest number that it takes."""
     return {"help": text, "metavar": metavar, "least": least}
 
 
 def _arg(text: str, default, **more):
-    return field(default=default, metadata=option(text, **more))
+    return field(default=default, metadata=_option(text, **more))
 
 
 @dataclass(frozen=True)
@@ -90,5 +90,5 @@ class PrepareSettings:
     accept_proposed_masks: bool = _arg("use the proposed masks, which the dataset card then says", False)
     refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
     layout: Layout | None = field(
-        default=None, metadata=option("YAML file that says where RGB and mask files lie", metavar="FILE")
+        default=None, metadata=_option("YAML file that says where RGB and mask files lie", metavar="FILE")
     )

@@ -94,42 +94,25 @@ def _decide(match: Matches, moving: Frame, fixed: Frame, treated: bool) -> Regis
         text = "the matches move by half a pixel or more, the pixels outside the target do not"
         figures.method = "pixels"
         return Registration("identity", np.eye(3), figures, warnings=[Remark("by_pixels", text)])
-    bound = settings.max_displacement * float(np.hypot(*fixed.size))
-    ratio = match.inlier_ratio
-    checks = [
-        (
-            max(corner, moved) > bound,
-            "moved_too_far",
-            f"a corner moves by {max(corner, moved):.1f} px, bound {bound:.1f}",
-        ),
-        (
-            bent > settings.max_distortion,
-            "distorted",
-            f"lengths change by {100 * bent:.1f} %, bound {100 * settings.max_distortion:.1f} %",
-        ),
-        (
-            ratio < settings.min_inlier_ratio,
-            "low_inlier_ratio",
-            f"{match.count} of {match.near.sum()} matches agree ({100 * ratio:.0f} %), "
-            f"{100 * settings.min_inlier_ratio:.0f} % needed",
-        ),
-        (
-            error > settings.max_target_error,
-            "uncertain",
-            f"the map may be {error:.2f} px off at the target's corners, bound {settings.max_target_error}",
-        ),
-        (
-            fit.correlation < settings.min_correlation,
-            "no_match",
-            f"the pictures outside the target correlate by {fit.correlation:.2f}, {settings.min_correlation} needed",
-        ),
-        (
-            not after <= before,
-            "worse_outside",
-            f"warping would raise the difference outside the target from {before:.2f} to {after:.2f}",
-        ),
-    ]
-    reasons = [Remark(code, text) for failed, code, text in checks if failed]
+    bound, farthest = settings.max_displacement * float(np.hypot(*fixed.size)), max(corner, moved)
+    reasons = []
+    if farthest > bound:
+        reasons.append(Remark("moved_too_far", f"a corner moves by {farthest:.1f} px, bound {bound:.1f}"))
+    if bent > settings.max_distortion:
+        text = f"lengths change by {100 * bent:.1f} %, bound {100 * settings.max_distortion:.1f} %"
+        reasons.append(Remark("distorted", text))
+    if match.inlier_ratio < settings.min_inlier_ratio:
+        text = f"{match.count} of {match.near.sum()} matches agree ({100 * match.inlier_ratio:.0f} %)"
+        reasons.append(Remark("low_inlier_ratio", f"{text}, {100 * settings.min_inlier_ratio:.0f} % needed"))
+    if error > settings.max_target_error:
+        text = f"the map may be {error:.2f} px off at the target's corners, bound {settings.max_target_error}"
+        reasons.append(Remark("uncertain", text))
+    if fit.correlation < settings.min_correlation:
+        text = f"the pictures outside the target correlate by {fit.correlation:.2f}, {settings.min_correlation} needed"
+        reasons.append(Remark("no_match", text))
+    if not after <= before:
+        text = f"warping would raise the difference outside the target from {before:.2f} to {after:.2f}"
+        reasons.append(Remark("worse_outside", text))
     if treated and fit is not match.fit and [item.code for item in reasons] == ["low_inlier_ratio"]:
         figures.method = "pixels"
         return Registration("warped", matrix, figures, warnings=reasons)

@@ -18,7 +18,7 @@ from gift_peft import cli
 from gift_peft.dataset.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.group_step import GroupStep
-from gift_peft.training import checkpoints, loop, train, validation
+from gift_peft.training import checkpoints, loop, progress, train, validation
 
 
 @pytest.fixture
@@ -48,11 +48,11 @@ def half_a_file(tensors, path):
     kill()
 
 
-def renaming(name):
-    """Kills when a folder is about to get this name."""
+def renaming(source, target):
+    """Kills when a folder of this name is about to get that one."""
 
-    def act(source, target):
-        if os.path.basename(target) == name:
+    def act(*paths):
+        if [os.path.basename(path) for path in paths] == [source, target]:
             kill()
 
     return act
@@ -73,7 +73,7 @@ MOMENTS = {
         os,
         "replace",
         0,
-        renaming("checkpoint-3"),
+        renaming(".checkpoint-3.tmp", "checkpoint-3"),
         {"checkpoint-2": True, f".checkpoint-3.tmp/{checkpoints.CHECKSUMS}": True, "checkpoint-3": False},
     ),
     "between best adapter and metrics": (loop, "write_metrics", 2, kill, {"adapter": True, "checkpoint-2": False}),
@@ -81,7 +81,7 @@ MOMENTS = {
         os,
         "replace",
         0,
-        renaming(".checkpoint-1.tmp"),
+        renaming("checkpoint-1", ".checkpoint-1.tmp"),
         {"checkpoint-1": True, "checkpoint-3": True},
     ),
 }
@@ -291,17 +291,6 @@ def test_two_processes_give_the_adapter_of_one(base_dir, tree, whole, tmp_path):
     assert json.loads((tmp_path / "out/adapter/gift.json").read_text())["num_processes"] == 2
 
 
-def test_new_folder_is_whole_or_absent(tmp_path):
-    target = tmp_path / "target"
-    with checkpoints.new_folder(target) as folder:
-        (folder / "a").write_text("old")
-    with pytest.raises(OSError, match="full"), checkpoints.new_folder(target) as folder:
-        (folder / "a").write_text("new")
-        raise OSError("disk full")
-    assert [path.name for path in tmp_path.iterdir()] == ["target"]
-    assert (target / "a").read_text() == "old"
-
-
 def test_leftovers_give_a_replaced_folder_its_name_back(tmp_path):
     for name in (".checkpoint-2.old", ".checkpoint-3.old", "checkpoint-3", ".checkpoint-4.tmp"):
         (tmp_path / name).mkdir()
@@ -326,7 +315,7 @@ def test_leftovers_are_a_runs_own(tmp_path):
 
 
 def test_the_command_to_go_on_survives_a_space(tmp_path):
-    text = loop._how_to_resume(tmp_path / "my run", 3)
+    text = progress.how_to_resume(tmp_path / "my run", 3)
     assert f"--config '{tmp_path}/my run/config.yaml' --resume" in text
 
 

@@ -14,6 +14,7 @@ from typing import Literal, get_origin
 
 import yaml
 
+from gift_peft.files import read_yaml
 from gift_peft.models.pixels import parse_size
 
 # What a run may be resumed with when it differs: everything else changes the weights that come out.
@@ -79,10 +80,6 @@ class GiftTrainingArguments:
     lambda_d: float = _arg("weight of the self-distillation, Eq. 6; 0 collapses the depth", 1.0)
     micro_batch_size: int = _arg("images per forward; bounds the memory, not the gradient", 2)
     retain: str = _arg("images whose graphs are kept instead of replayed: 0 (the paper), a number, or auto", "auto")
-    snapshot_micro_batch_size: int | None = _arg(
-        "images per forward of snapshots that are replayed; default: micro_batch_size, other sizes change the bits",
-        None,
-    )
     gradient_checkpointing: bool = _arg(
         "recompute the blocks in the backward; smaller graphs, more are retained", False
     )
@@ -143,7 +140,6 @@ class GiftTrainingArguments:
             "num_train_epochs",
             "checkpointing_steps",
             "checkpoints_total_limit",
-            "snapshot_micro_batch_size",
         ):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ValueError(f"{name}: must be at least 1, got {value}")
@@ -176,8 +172,6 @@ class GiftTrainingArguments:
             raise ValueError(f"checkpoint_at_steps: expected numbers of updates, got {given!r}") from None
         if any(step < 1 for step in self.checkpoint_at_steps):
             raise ValueError(f"checkpoint_at_steps: must be at least 1, got {min(self.checkpoint_at_steps)}")
-        if self.snapshot_micro_batch_size is not None and self.retain == "auto":
-            raise ValueError("snapshot_micro_batch_size: give retain as a number too, or results depend on the memory")
         self._check_recipe()
         if self.max_steps < 1 and self.max_steps != -1:
             raise ValueError(f"max_steps: must be at least 1, or -1, got {self.max_steps}")
@@ -235,14 +229,7 @@ def _raise(message: str):
 
 def _yaml_to_argv(path: Path) -> list[str]:
     """The file's keys as if they stood on the command line, so that both are checked by the same parser."""
-    if not path.is_file():
-        raise FileNotFoundError(f"config: no such file: {path}")
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"config {path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(values, dict):
-        raise ValueError(f"config {path}: expected lines of the form `key: value`")
+    values = read_yaml(path, f"config {path}")
     argv = []
     types = {f.name: f.type for f in fields(GiftTrainingArguments)}
     for key, value in values.items():

@@ -23,7 +23,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from gift_peft.dataset.gift_i import dataset_fingerprint
-from gift_peft.files import jsonable, write_whole
+from gift_peft.files import jsonable, reason, whole_folder, write_whole
 from gift_peft.models.identity import teacher_revision
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
 
@@ -103,7 +103,7 @@ def write_checkpoint(
 ) -> None:
     """`output_dir/checkpoint-<step>`, whole or not at all; `save(folder)` writes the adapter. OSError if it fails."""
     target = output_dir / f"checkpoint-{state.step}"
-    with disk_errors(target), new_folder(target) as folder:
+    with disk_errors(target), whole_folder(target) as folder:
         save(folder)
         save_file(optimizer_tensors(model, optimizer), folder / OPTIMIZER)
         save_file(_rng_tensors(), folder / RNG)
@@ -150,7 +150,7 @@ def restore(
         write_metrics(output_dir, state.rows)
         best = output_dir / "adapter"
         if state.best_step:
-            with new_folder(best) as folder:
+            with whole_folder(best) as folder:
                 shutil.copytree(checkpoint / BEST, folder, dirs_exist_ok=True)
         else:
             shutil.rmtree(best, ignore_errors=True)
@@ -234,7 +234,7 @@ def checkpoint_fault(folder: Path) -> str | None:
     except FileNotFoundError as error:
         return f"{Path(error.filename).name} is missing"
     except (OSError, ValueError, AttributeError) as error:
-        return " ".join(str(error).split())
+        return reason(error)
     return None
 
 
@@ -256,27 +256,6 @@ def prune_checkpoints(output_dir: Path, step: int, limit: int | None, keep: list
         gone = folder.with_name(f".{folder.name}.tmp")
         os.replace(folder, gone)
         shutil.rmtree(gone)
-
-
-@contextmanager
-def new_folder(target: Path):
-    """A temporary folder beside `target` that takes its name when the block ends well, and vanishes otherwise."""
-    temporary, old = target.with_name(f".{target.name}.tmp"), target.with_name(f".{target.name}.old")
-    for folder in (temporary, old):
-        shutil.rmtree(folder, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    try:
-        yield temporary
-        for path in [*_files(temporary), *(p for p in temporary.rglob("*") if p.is_dir()), temporary]:
-            _sync(path)
-        if target.exists():
-            os.replace(target, old)
-        os.replace(temporary, target)
-        _sync(target.parent)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
 
 
 @contextmanager
@@ -360,14 +339,3 @@ def _link_weights(source: str, target: str) -> None:
 def _digest(path: Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _sync(path: Path) -> None:
-    on_windows = os.name == "nt"
-    if on_windows and path.is_dir():
-        return  # a folder cannot be opened there
-    descriptor = os.open(path, os.O_RDWR if on_windows else os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

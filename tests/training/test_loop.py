@@ -19,7 +19,7 @@ from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.loader import PreparedGroups, epoch_order
 from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.losses import geometry_consistency_error
-from gift_peft.training import checkpoints, loop, start, train
+from gift_peft.training import GiftTrainingArguments, checkpoints, loop, start, train
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
 pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
@@ -90,6 +90,19 @@ def test_row_zero_is_the_base(run, groups, base_dir):
     report = evaluate_gift_i(groups("validation"), base, kind="inverse_depth", progress=False)
     assert row["val_gce"] == report.gce["base"]
     assert row["val_tom_rmse"] == report.summary["tom"]["rmse"]
+
+
+def test_arguments_may_be_given_one_by_one(base_dir, tree, tmp_path):
+    given = {"model_name_or_path": base_dir, "dataset_name": tree, "output_dir": tmp_path / "out", "size": "56x70"}
+    assert train(**given, max_steps=1).step == 1
+    args = GiftTrainingArguments(**given)
+    with pytest.raises(TypeError, match="not both: max_steps, seed"):
+        train(args, max_steps=2, seed=1)
+    with pytest.raises(TypeError, match="lerning_rate"):
+        train(**given, lerning_rate=1e-3)
+    with pytest.raises(TypeError, match="output_dir"):
+        train(model_name_or_path="m", dataset_name="d")
+    assert train(args=GiftTrainingArguments(**given, max_steps=2, resume_from_checkpoint="latest")).step == 2
 
 
 def test_booster_is_measured_where_a_root_is_given(base_dir, tree, tmp_path):

@@ -38,6 +38,9 @@ class OptionParser(argparse.ArgumentParser):
         text = "show the traceback of an error"
         self.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=text)
 
+    def knows(self, option: str) -> bool:
+        return _hyphens(option) in self._option_string_actions
+
     def parse_known_args(self, args=None, namespace=None):
         words = sys.argv[1:] if args is None else args
         return super().parse_known_args([_hyphens(word) for word in words], namespace)

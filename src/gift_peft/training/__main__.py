@@ -10,7 +10,6 @@ __all__ = ["make_parser", "run"]
 
 
 def run(argv: Sequence[str]) -> int:
-    """The exit code of a training with these arguments: 0, or 128 and the signal that stopped it."""
     arguments = parse_arguments(argv)
     from gift_peft.training.loop import train  # after the arguments are known to be right: this takes seconds
 

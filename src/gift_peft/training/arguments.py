@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Literal, get_origin
 
@@ -194,15 +195,21 @@ class GiftTrainingArguments:
 
 
 def make_parser() -> OptionParser:
-    """The command line's: hyphens or underscores, and a second name for base, dataset and output folder."""
-    from transformers import HfArgumentParser
-
     return OptionParser(
         "train",
         "Fine-tune a model on groups of images into an adapter.",
         "gift-peft train --base depth-anything/Depth-Anything-V2-Small-hf --dataset gift-i --out run",
-        parents=[HfArgumentParser(GiftTrainingArguments, add_help=False)],
+        parents=[_hf_argument_parser()(GiftTrainingArguments, add_help=False)],
     )
+
+
+def _hf_argument_parser() -> type[argparse.ArgumentParser]:
+    """transformers' `HfArgumentParser`, from its own file: with transformers come our models, and with them torch."""
+    file = Path(find_spec("transformers").origin).with_name("hf_argparser.py")
+    spec = spec_from_file_location(file.stem, file)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.HfArgumentParser
 
 
 def parse_arguments(argv: Sequence[str]) -> GiftTrainingArguments:
@@ -217,10 +224,9 @@ def parse_arguments(argv: Sequence[str]) -> GiftTrainingArguments:
     config.error = parser.error = _raise
     path = config.parse_known_args(argv)[0].config
     from_file = [] if path is None else _yaml_to_argv(path)
-    known = {option.replace("-", "_") for option in parser._option_string_actions}
     for option in (word.partition("=")[0] for word in argv if word.startswith("--")):
-        if option.replace("-", "_") not in known:
-            raise ValueError(f"unknown argument {option}{_nearest(option.strip('-').replace('-', '_'))}")
+        if not parser.knows(option):
+            raise ValueError(f"unknown argument {option}{_nearest(option[2:].replace('-', '_'))}")
     values, unknown = parser.parse_known_args([*from_file, *argv])
     if unknown:
         raise ValueError(f"unknown argument {unknown[0]}")

@@ -322,7 +322,7 @@ def test_the_command_to_go_on_survives_a_space(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["torchrun", "accelerate"])
 def test_documented_launch_lines(launcher, base_dir, tree, tmp_path):
-    """The lines of `gift_peft.training`'s docstring, on CPUs."""
+    """The lines of docs/several-gpus.md, on CPUs."""
     lines = {
         "torchrun": [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"],
         "accelerate": ["accelerate", "launch", "--multi_gpu", "--num_processes=2", "--main_process_port=0"],

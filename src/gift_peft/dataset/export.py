@@ -23,8 +23,14 @@ from tqdm import tqdm
 from gift_peft.dataset.gift_i import FEATURES, gift_i_splits, load_gift_i
 from gift_peft.dataset.writer import CARD
 
-# The pictures are compressed already; chunking by content lets a changed dataset upload only what changed.
-OPTIONS = {"compression": "none", "use_content_defined_chunking": True, "write_page_index": True}
+# The pictures are compressed already; statistics of them would be whole small pictures once more, several times;
+# chunking by content lets a changed dataset upload only what changed.
+OPTIONS = {
+    "compression": "none",
+    "write_statistics": ["group_id"],
+    "use_content_defined_chunking": True,
+    "write_page_index": True,
+}
 EMPTY_CARD = CARD.format(
     license="",
     pretty_name="GIFT-I",

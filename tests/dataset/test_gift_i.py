@@ -5,6 +5,8 @@ import pickle
 import shutil
 import subprocess
 import sys
+from importlib.resources import files
+from pathlib import Path
 
 import datasets
 import numpy as np
@@ -39,6 +41,22 @@ def test_plain_load_dataset_reads_the_prepared_folder(prepared):
     assert row["depths"][0].mode == "I;16" and row["reference"].size == (80, 60)
     schemas = [pq.read_schema(prepared / split / "metadata.parquet") for split in ("train", "validation")]
     assert schemas[0] == schemas[1] == SCHEMA
+
+
+def test_a_folder_of_pictures_kept_from_before():
+    """One embedded group in the form in which the package used to ship them; its shards hold the same files."""
+    folder = Path(__file__).parents[1] / "fixtures" / "prepared"
+    loose = load_gift_i(folder, "validation")
+    shipped = load_gift_i(str(files("gift_peft.demo") / "gift-i"), "validation")
+    same = shipped.select([shipped["group_id"].index("mirror_003")])
+    assert dataset_fingerprint(loose) == dataset_fingerprint(same)
+    assert len(loose) == 1 and loose["image_names"] == same["image_names"] and loose["surface"] == same["surface"]
+    for own, other in zip(loose[0]["depths"], same[0]["depths"], strict=True):
+        assert np.array_equal(np.asarray(own), np.asarray(other))
+    plain = datasets.load_dataset(str(folder), split="validation", features=FEATURES)[0]
+    assert [np.asarray(image).tolist() for image in plain["images"]] == [
+        np.asarray(image).tolist() for image in same[0]["images"]
+    ]
 
 
 @pytest.mark.parametrize("name", ["data [v2]", "what?", "50 % *", "Küche (alt)"])

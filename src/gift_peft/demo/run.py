@@ -13,6 +13,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.demo.validation_page import validation_page
 from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.evaluation.results import GiftIReport
 from gift_peft.evaluation.tables import markdown_table, text_table
@@ -43,8 +44,9 @@ def run_demo(
     """Trains, evaluates and writes `out`; returns the reports against the proxy and against true depth.
 
     Args:
-        out: gets `base/`, `gift-i/`, `adapter/` (naming the base by the path out/base), `report.md`,
-            `before_after.png`, `metrics.jsonl`, `evaluation-proxy/` and `evaluation-depth/`.
+        out: gets `base/`, `gift-i/` (parquet shards, proxies beside them), `adapter/` (naming the base by the path
+            out/base), `report.md`, `before_after.png`, `validation.html`, `metrics.jsonl`, `evaluation-proxy/` and
+            `evaluation-depth/`.
         overwrite_output_dir: delete the run that `out` holds.
         seed: of the LoRA initialisation and the order of the groups.
         extra: training arguments that win over the demo's, as on the command line (`--lambda_d=0`).
@@ -89,6 +91,7 @@ def run_demo(
         report.save(out / f"evaluation-{reference}")
         reports[reference] = report
     before_after(_panels(groups, reports["depth"], loaded), out / "before_after.png")
+    write_whole(out / "validation.html", validation_page(groups))
     write_whole(out / "report.md", _markdown(reports, args))
     _print_summary(reports, out)
     return reports
@@ -157,7 +160,8 @@ These are results on rendered scenes; they show the method at work, not what a l
 
 ![RGB, true depth, base and adapted for a mirror, a pane and a glass object](before_after.png)
 
-For each kind of target the picture shows the observation on which the base errs most.
+For each kind of target the picture shows the observation on which the base errs most;
+[validation.html](validation.html) shows every validation group.
 
 ## Against true depth
 

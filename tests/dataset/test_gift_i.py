@@ -19,9 +19,13 @@ from helpers.tiny import SIZE, tiny_processor, write_group, write_raw_tree
 from PIL import Image
 from torch.utils.data import DataLoader
 
+from gift_peft.dataset.cache import GroupCache
 from gift_peft.dataset.gift_i import FEATURES, GiftI, dataset_fingerprint, gift_i_splits, load_gift_i
+from gift_peft.dataset.rows import parsed
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.dataset.writer import SCHEMA, write_gift_i
+from gift_peft.rules import GroupPictures
+from gift_peft.training.teacher import make_proxies
 
 CLEARGRASP = os.path.join(os.path.dirname(__file__), "..", "..", "..", "shared", "data", "cleargrasp_d435")
 
@@ -93,7 +97,30 @@ def test_streaming_workers_and_slices(prepared):
     group = collate_group(row, tiny_processor(), SIZE)
     again = collate_group(load_gift_i(prepared, "validation")[0], tiny_processor(), SIZE)
     assert group.surface == "mirror" and torch.equal(group.pixel_values, again.pixel_values)
-    assert torch.equal(group.mask, again.mask) and torch.equal(group.depths[1], again.depths[1])
+    assert torch.equal(group.mask, again.mask) and np.array_equal(group.pictures.depths[1], again.pictures.depths[1])
+
+
+def test_inside_the_package_a_group_is_parsed_once(prepared, base_dir, monkeypatch):
+    made = []
+    check = GroupPictures.__post_init__
+    monkeypatch.setattr(GroupPictures, "__post_init__", lambda self: made.append(self.group_id) or check(self))
+    rows = load_gift_i(prepared, "validation")
+    group = parsed(rows)[0]
+    assert isinstance(group, GroupPictures) and group.surface == "mirror" and made == ["scene_100"]
+    assert (group.images[0].mode, group.masks[0].dtype, group.depths[0].dtype) == ("RGB", bool, np.uint16)
+    whole = collate_group(group, tiny_processor(), SIZE)
+    assert whole.pictures is group and made == ["scene_100"]
+    row = collate_group(rows[0], tiny_processor(), SIZE)  # a dict may have been changed, so it is parsed where taken
+    assert torch.equal(row.mask, whole.mask) and torch.equal(row.pixel_values, whole.pixel_values)
+    assert parsed([rows]) == [rows]
+    for read in (
+        lambda: dataset_fingerprint(rows),
+        lambda: make_proxies(base_dir, prepared, ["validation"], SIZE),
+        lambda: GroupCache(rows, tiny_processor(), SIZE, None).read(0),
+    ):
+        made.clear()
+        read()
+        assert made == ["scene_100"]
 
 
 def test_rows_behave_as_a_dataset(prepared):

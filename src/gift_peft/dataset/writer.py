@@ -6,7 +6,6 @@ a readable copy `groups.jsonl`, and a dataset card whose YAML names the files of
 
 import hashlib
 import json
-import os
 import re
 import shutil
 from collections.abc import Iterable
@@ -17,9 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from gift_peft.files import write_whole
+from gift_peft.files import whole_folder, write_whole
 from gift_peft.images import image_digest, open_image, to_mask, to_rgb
-from gift_peft.rules import SPLITS, SURFACES, check_group, check_group_id, label_items
+from gift_peft.rules import SPLITS, SURFACES, check_group_id, parse_group
 
 NAMES = pa.list_(pa.string())
 SCHEMA = pa.schema(
@@ -143,36 +142,33 @@ def write_group(group: dict, root: Path) -> dict:
         raise ValueError(f"group {group_id}: split {split!r}; write train or validation")
     folder = root / split
     check_group_id(group_id)
-    surface = group.get("surface")
+    surface, reference = group.get("surface"), group.get("reference")
     if surface is not None and surface not in SURFACES:
         raise ValueError(f"group {group_id}: surface {surface!r}; it is one of {', '.join(SURFACES)} or None")
     names = list(group.get("image_names") or _default_names(group["images"]))
-    images = [_rgb(*item) for item in label_items(group_id, names, "image", group["images"])]
-    masks = [_mask(*item) for item in label_items(group_id, names, "mask", group["masks"])]
-    valids = [_mask(*item) for item in label_items(group_id, names, "valid mask", group.get("valids"), True)]
-    depths = [_depth(*item) for item in label_items(group_id, names, "depth", group.get("depths"), True)]
-    reference = group.get("reference")
-    reference_image = None if reference is None else _rgb(reference, f"group {group_id}: the reference")
-    check_group(group_id, names, images, masks, valids, depths, reference_image, train=split == "train")
+    pictures = parse_group({**group, "image_names": names}, _rgb, _mask, _depth)
+    if split == "train":
+        pictures.check_target()
     least = 1 if split == "validation" and reference is not None else 2
-    if len({image_digest(image) for image in images}) < max(least, len(images)):
-        raise ValueError(f"group {group_id}: {len(images)} images; it takes at least {least}, all different")
+    if len({image_digest(image) for image in pictures.images}) < max(least, len(names)):
+        raise ValueError(f"group {group_id}: {len(names)} images; it takes at least {least}, all different")
 
-    partial = folder / f".{group_id}.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    files = {kind: [] for kind in ("images", "masks", "valids", "depths")}
     stems = [f"{index:02d}_{re.sub(r'[^A-Za-z0-9_.-]', '_', Path(name).stem)}" for index, name in enumerate(names)]
-    for kind, items in (("images", group["images"]), ("masks", masks), ("valids", valids), ("depths", depths)):
-        for stem, item in zip(stems, items, strict=False):
-            files[kind].append(f"{group_id}/{kind}/{_save(item, partial / kind / stem)}")
-    reference_file = None if reference is None else f"{group_id}/{_save(reference, partial / 'reference')}"
-    shutil.rmtree(folder / group_id, ignore_errors=True)
-    os.replace(partial, folder / group_id)
+    items = {"images": group["images"], **{kind: getattr(pictures, kind) for kind in ("masks", "valids", "depths")}}
+    with whole_folder(folder / group_id) as place:
+        files = {
+            f"{kind}_file_names": [
+                f"{group_id}/{kind}/{_save(item, place / kind / stem)}"
+                for stem, item in zip(stems, parts, strict=False)
+            ]
+            for kind, parts in items.items()
+        }
+        reference_file = None if reference is None else f"{group_id}/{_save(reference, place / 'reference')}"
     return {
         "group_id": group_id,
         "surface": surface,
         "image_names": names,
-        **{f"{kind}_file_names": paths for kind, paths in files.items()},
+        **files,
         "reference_file_name": reference_file,
     }
 

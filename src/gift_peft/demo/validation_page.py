@@ -11,9 +11,8 @@ from collections.abc import Iterable
 import numpy as np
 from PIL import Image
 
-from gift_peft.images import to_mask
 from gift_peft.reports.figures import outline
-from gift_peft.rules import SURFACES
+from gift_peft.rules import GroupPictures
 
 ENLARGE = 2  # the pictures are small; the outline stays a line
 
@@ -36,22 +35,20 @@ target's surface made visible.</p>
 """
 
 
-def validation_page(rows: Iterable[dict]) -> str:
-    """The page of these rows of `load_gift_i`, one group at a time."""
-    return PAGE.format(groups="\n".join(map(_group, rows)))
+def validation_page(groups: Iterable[GroupPictures]) -> str:
+    """The page of these groups, read one at a time."""
+    return PAGE.format(groups="\n".join(map(_group, groups)))
 
 
-def _group(row: dict) -> str:
-    figures = []
-    for name, image, mask in zip(row["image_names"], row["images"], row["masks"], strict=True):
-        figures.append(_figure(image, name, to_mask(mask, name)))
-    if row["reference"] is not None:
-        figures.append(_figure(row["reference"], "treated reference"))
-    title = row["group_id"] if row["surface"] is None else f"{row['group_id']}, {SURFACES[row['surface']]}"
+def _group(group: GroupPictures) -> str:
+    figures = list(map(_figure, group.names, group.images, group.masks))
+    if group.reference is not None:
+        figures.append(_figure("treated reference", group.reference))
+    title = ", ".join(filter(None, (group.group_id, group.surface)))
     return f"<h2>{html.escape(title)}</h2>\n<div>{''.join(figures)}</div>"
 
 
-def _figure(image: Image.Image, caption: str, mask: np.ndarray | None = None) -> str:
+def _figure(caption: str, image: Image.Image, mask: np.ndarray | None = None) -> str:
     image = image.resize((ENLARGE * image.width, ENLARGE * image.height), Image.Resampling.BICUBIC)
     if mask is not None:
         image = Image.fromarray(outline(np.asarray(image), mask))

@@ -93,8 +93,9 @@ def parse_group(
     group_id, names = record["group_id"], list(record["image_names"])
 
     def convert(column: str, kind: str, function: Callable[[Any, str], Any]) -> list:
+        items = record.get(column)
         called = (f"group {group_id}: the {kind} of {name}" for name in chain(names, repeat("an image too many")))
-        return [function(item, name) for item, name in zip(record.get(column) or (), called, strict=False)]
+        return [] if items is None else [function(*pair) for pair in zip(items, called, strict=False)]
 
     reference, surface = record.get("reference"), record.get("surface")
     return GroupPictures(

@@ -24,6 +24,7 @@ from gift_peft.dataset.gift_i import FEATURES, GiftI, dataset_fingerprint, gift_
 from gift_peft.dataset.rows import parsed
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.dataset.writer import SCHEMA, write_gift_i
+from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.rules import GroupPictures
 from gift_peft.training.teacher import make_proxies
 
@@ -121,6 +122,19 @@ def test_inside_the_package_a_group_is_parsed_once(prepared, base_dir, monkeypat
         made.clear()
         read()
         assert made == ["scene_100"]
+
+
+def test_hand_made_rows_are_evaluated_as_ours(prepared):
+    rows = load_gift_i(prepared, "validation")
+    options = {"reference": "depth", "kind": "depth", "processor": tiny_processor(), "size": SIZE, "progress": False}
+    want = evaluate_gift_i(rows, lambda pixels: pixels[:, 0], **options)
+    columns = ("group_id", "image_names", "images", "masks", "depths")
+    row = {key: rows[0][key] for key in columns} | {"surface": "mirror"}  # what else there may be is left out
+    report = evaluate_gift_i([row], lambda pixels: pixels[:, 0], **options)
+    assert report.rows == want.rows
+    row["masks"] = [mask.crop((0, 0, 20, 20)) for mask in row["masks"]]
+    with pytest.raises(ValueError, match=r"group scene_100: the mask of 0\.png is 20x20"):
+        evaluate_gift_i([row], lambda pixels: pixels[:, 0], **options)
 
 
 def test_rows_behave_as_a_dataset(prepared):

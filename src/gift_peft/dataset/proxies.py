@@ -132,23 +132,17 @@ class ProxyStore:
         path = Path(self.folder) / f"{group_id}.safetensors"
         if not path.exists():
             raise FileNotFoundError(f"missing proxy {path}; make it with `{self.command}`")
-        header = read_header(path, self.command)
-        tensors = safetensors.torch.load_file(path)
-        if "proxies" not in tensors:
-            raise ValueError(
-                f"damaged proxy {path} (not a proxy file); make it again with `{self.command} --overwrite`"
-            )
-        if len(tensors["proxies"]) != len(header.get("images", tensors["proxies"])):
-            raise ValueError(
-                f"damaged proxy {path} (it holds {len(tensors['proxies'])} of {len(header['images'])} proxies); "
-                f"make it again with `{self.command} --overwrite`"
-            )
-        for name, proxy in [*zip(names, tensors["proxies"], strict=False), ("reference", tensors.get("reference"))]:
+        header, tensors = read_header(path, self.command), safetensors.torch.load_file(path)
+        proxies, reference = tensors.get("proxies"), tensors.get("reference")
+        again = f"make it again with `{self.command} --overwrite`"
+        if proxies is None:
+            raise ValueError(f"damaged proxy {path} (not a proxy file); {again}")
+        made = len(header.get("images", proxies))
+        if len(proxies) != made:
+            raise ValueError(f"damaged proxy {path} (it holds {len(proxies)} of {made} proxies); {again}")
+        for name, proxy in [*zip(names, proxies, strict=False), ("reference", reference)]:
             if proxy is not None and not proxy.isfinite().all():
-                raise ValueError(
-                    f"NaN or infinite values in proxy {path} ({name}); make it again with `{self.command} --overwrite`"
-                )
-        changed = difference(header, {**self.expected, **digests}, names)
-        if changed:
-            raise ValueError(f"stale proxy {path}: {changed}; make it again with `{self.command} --overwrite`")
-        return tensors["proxies"], tensors.get("reference")
+                raise ValueError(f"NaN or infinite values in proxy {path} ({name}); {again}")
+        if changed := difference(header, {**self.expected, **digests}, names):
+            raise ValueError(f"stale proxy {path}: {changed}; {again}")
+        return proxies, reference

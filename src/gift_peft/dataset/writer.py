@@ -140,7 +140,6 @@ def write_group(group: dict, root: Path) -> dict:
     group_id, split = group["group_id"], group.get("split")
     if split not in SPLITS:
         raise ValueError(f"group {group_id}: split {split!r}; write train or validation")
-    folder = root / split
     check_group_id(group_id)
     surface, reference = group.get("surface"), group.get("reference")
     if surface is not None and surface not in SURFACES:
@@ -154,23 +153,14 @@ def write_group(group: dict, root: Path) -> dict:
         raise ValueError(f"group {group_id}: {len(names)} images; it takes at least {least}, all different")
 
     stems = [f"{index:02d}_{re.sub(r'[^A-Za-z0-9_.-]', '_', Path(name).stem)}" for index, name in enumerate(names)]
-    items = {"images": group["images"], **{kind: getattr(pictures, kind) for kind in ("masks", "valids", "depths")}}
-    with whole_folder(folder / group_id) as place:
-        files = {
-            f"{kind}_file_names": [
-                f"{group_id}/{kind}/{_save(item, place / kind / stem)}"
-                for stem, item in zip(stems, parts, strict=False)
-            ]
-            for kind, parts in items.items()
-        }
-        reference_file = None if reference is None else f"{group_id}/{_save(reference, place / 'reference')}"
-    return {
-        "group_id": group_id,
-        "surface": surface,
-        "image_names": names,
-        **files,
-        "reference_file_name": reference_file,
-    }
+    parts = {"images": group["images"], **{kind: getattr(pictures, kind) for kind in ("masks", "valids", "depths")}}
+    row = {"group_id": group_id, "surface": surface, "image_names": names}
+    with whole_folder(root / split / group_id) as folder:
+        for kind, items in parts.items():
+            files = [_save(item, folder / kind / stem) for item, stem in zip(items, stems, strict=False)]
+            row[f"{kind}_file_names"] = [f"{group_id}/{kind}/{file}" for file in files]
+        file = None if reference is None else f"{group_id}/{_save(reference, folder / 'reference')}"
+    return row | {"reference_file_name": file}
 
 
 def _default_names(images: list) -> list[str]:
@@ -181,7 +171,7 @@ def _default_names(images: list) -> list[str]:
 
 
 def _rgb(source, name: str) -> Image.Image:
-    at = name if isinstance(source, Image.Image) else f"{source}"
+    at = name if isinstance(source, Image.Image) else str(source)
     return to_rgb(open_image(source, at), at)
 
 
@@ -189,8 +179,8 @@ def _mask(source, name: str) -> np.ndarray:
     if isinstance(source, np.ndarray):
         if source.ndim != 2 or source.dtype not in (bool, np.uint8):
             raise ValueError(f"{name}: a mask is (H, W) bool, got {source.shape} {source.dtype}")
-        return to_mask(Image.fromarray(source.astype(np.uint8) if source.dtype == bool else source), name)
-    at = name if isinstance(source, Image.Image) else f"{source}"
+        return source if source.dtype == bool else to_mask(Image.fromarray(source), name)
+    at = name if isinstance(source, Image.Image) else str(source)
     return to_mask(open_image(source, at), at)
 
 
@@ -229,7 +219,8 @@ def _write_metadata(path: Path, rows: Iterable[dict]) -> None:
 
 def _card(rows: dict[str, dict], license: str, pretty_name: str, description: str, content: str) -> str:
     present = [split for split in SPLITS if rows[split]]
-    counts = [f"{split}: {len(rows[split])} groups, {_count_images(rows[split])} images" for split in present]
+    images = {split: sum(len(row["image_names"]) for row in rows[split].values()) for split in present}
+    counts = [f"{split}: {len(rows[split])} groups, {images[split]} images" for split in present]
     return CARD.format(
         license=license,
         pretty_name=json.dumps(pretty_name),
@@ -239,7 +230,3 @@ def _card(rows: dict[str, dict], license: str, pretty_name: str, description: st
         counts="; ".join(counts) + ".",
         data_files="\n".join(f"  - split: {split}\n    path: {split}/**" for split in present),
     )
-
-
-def _count_images(rows: dict[str, dict]) -> int:
-    return sum(len(row["image_names"]) for row in rows.values())

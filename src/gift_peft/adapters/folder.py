@@ -19,7 +19,7 @@ from peft import LoraConfig, PeftConfig, PeftModel
 from peft.tuners.lora import LoraLayer
 
 from gift_peft.adapters.scale import active_lora, active_saved_modules
-from gift_peft.files import jsonable
+from gift_peft.files import is_hub_id, jsonable
 
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
@@ -93,8 +93,8 @@ def _base_name(model: PeftModel) -> str | None:
 
 
 def _hub_name(base: str | None, card: str | None) -> str | None:
-    """`base` if it may stand in a card: not a path of this machine."""
-    if base is None or not Path(base).exists():
+    """`base` if it may stand in a card: a hub id, not a path of this machine."""
+    if base is None or is_hub_id(base):
         return base
     warnings.warn(
         f"the base is the local folder {base}: others cannot load this adapter by its base's name; "

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from gift_peft.adapters.folder import ADAPTER_WEIGHTS
 from gift_peft.evaluation.results import BoosterReport
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
@@ -28,7 +29,6 @@ from gift_peft.reports.model_card import model_card
 from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_names
 from gift_peft.reports.zero_shot import checkpoint_folders, draw_zero_shot
 
-WEIGHTS = "adapter_model.safetensors"
 COMPARED_GROUPS = 40  # compare.html has one observation of that many groups at most: it has to open in a browser
 
 
@@ -52,13 +52,10 @@ class Output:
             print(to_text(table, self.color))
 
     def figure(self, name: str, title: str, draw: Callable[..., object]) -> None:
-        """A figure as PNG and, with matplotlib, as PDF."""
-        draw(path=self.folder / f"{name}.png")
+        """A figure as PNG and as PDF."""
+        for suffix in (".png", ".pdf"):
+            draw(path=self.folder / f"{name}{suffix}")
         self.sections.append(f"![{title}]({name}.png)\n")
-        try:
-            draw(path=self.folder / f"{name}.pdf")
-        except ImportError as error:
-            self.remark(f"{name}.pdf: {error}")
 
     def remark(self, text: str) -> None:
         """Something that is not in the report, and why."""
@@ -146,10 +143,10 @@ def _is_of_adapter(run: SavedRun, report: AnyReport) -> bool:
     """Whether an evaluation is of the run's adapter as it is: not scaled, and not of one with other weights."""
     if not report.adapted or report.about.get("adapter_scale") not in (None, 1):
         return False
-    evaluated = Path(report.about.get("adapter") or "") / WEIGHTS
+    evaluated = Path(report.about.get("adapter") or "") / ADAPTER_WEIGHTS
     if run.adapter is None or not evaluated.is_file():
         return True  # nothing to compare with: the run was moved, or is an evaluation alone
-    return filecmp.cmp(evaluated, run.adapter / WEIGHTS, shallow=False)
+    return filecmp.cmp(evaluated, run.adapter / ADAPTER_WEIGHTS, shallow=False)
 
 
 def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> None:
@@ -376,11 +373,7 @@ def _group_panels(report, find, group_id: str, labels: dict[str, str], loaded, o
 def _zero_shot(
     run: SavedRun, name: str, images: Sequence[str | Path], steps: Sequence[int], output: Output, device: str | None
 ) -> None:
-    files = [output.folder / f"{name}.png", output.folder / f"{name}.pdf"]
-    try:
-        draw_zero_shot(run, images, steps, files, device)
-    except ImportError as error:
-        output.remark(f"{name}.pdf: {error}")
+    draw_zero_shot(run, images, steps, [output.folder / f"{name}.png", output.folder / f"{name}.pdf"], device)
     output.sections.append(f"## Pictures the training never saw\n\n![base and checkpoints]({name}.png)\n")
 
 

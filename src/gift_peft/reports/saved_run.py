@@ -9,7 +9,7 @@ import yaml
 
 from gift_peft.evaluation.results import load_report
 from gift_peft.evaluation.tables import AnyReport
-from gift_peft.reports.card_metadata import portable_name
+from gift_peft.files import portable_name
 
 
 @dataclass
@@ -61,7 +61,7 @@ def read_run(path: str | Path) -> SavedRun:
     if path.suffix in (".yaml", ".yml") and path.is_file():
         return SavedRun(path, _yaml(path))
     if (path / "metrics.json").is_file():
-        return SavedRun(path, evaluations={path.name: _evaluation(path)})
+        return SavedRun(path, evaluations={path.name: load_report(path)})
     if not ((path / "config.yaml").is_file() or (path / "metrics.jsonl").is_file()):
         raise FileNotFoundError(
             f"{path}: neither a run (config.yaml, metrics.jsonl), an evaluation (metrics.json) nor a YAML file of one"
@@ -75,7 +75,7 @@ def read_run(path: str | Path) -> SavedRun:
     if record.is_file():
         run.record = _json(record, record.read_text(encoding="utf-8"))
     for folder in sorted(child for child in path.iterdir() if (child / "metrics.json").is_file()):
-        run.evaluations[folder.name] = _evaluation(folder)
+        run.evaluations[folder.name] = load_report(folder)
     return run
 
 
@@ -135,10 +135,3 @@ def _json(path: Path, text: str) -> dict:
         return json.loads(text)
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: not valid JSON: {error}") from None
-
-
-def _evaluation(folder: Path) -> AnyReport:
-    try:
-        return load_report(folder)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"evaluation {folder}: not valid JSON: {error}") from None

@@ -19,6 +19,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from gift_peft.adapters.folder import ADAPTER_WEIGHTS
 from gift_peft.files import write_whole
 
 BEST = "best"
@@ -26,7 +27,7 @@ CHECKSUMS = "checksums.json"
 OPTIMIZER = "optimizer.safetensors"
 RNG = "rng_state.safetensors"
 STATE = "trainer_state.json"
-NEEDED = {"adapter_model.safetensors", OPTIMIZER, RNG, STATE}
+NEEDED = {ADAPTER_WEIGHTS, OPTIMIZER, RNG, STATE}
 # Temporary names of a run: of what it replaces as a whole, of that inside a checkpoint, and of single files.
 TEMPORARY = re.compile(
     r"\.+(adapter|adapter-last|checkpoint-\d+)(\.tmp)?\.(tmp|old)|\.(metrics\.jsonl|config\.yaml)\.\d+\.partial"
@@ -63,7 +64,7 @@ def read_checkpoint(folder: Path, model: torch.nn.Module, optimizer: torch.optim
     """Put adapter weights, optimizer state and RNG back as they were; the caller reads `read_state` itself."""
     from peft import set_peft_model_state_dict
 
-    result = set_peft_model_state_dict(model, load_file(folder / "adapter_model.safetensors"))
+    result = set_peft_model_state_dict(model, load_file(folder / ADAPTER_WEIGHTS))
     if result.unexpected_keys:
         raise ValueError(f"{folder}: the adapter does not fit this model, e.g. {result.unexpected_keys[0]}")
     load_optimizer_tensors(model, optimizer, load_file(folder / OPTIMIZER))

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import torch
 
-from gift_peft.reports.card_metadata import is_local, portable_name
+from gift_peft.adapters.folder import ADAPTER_FILES
+from gift_peft.files import is_hub_id, portable_name
 from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 
-UPLOADED = ["adapter_model.safetensors", "adapter_config.json", "gift.json", "preprocessor_config.json", "README.md"]
 PACKAGES = ("gift-peft", "torch", "transformers", "peft", "accelerate", "datasets")
 # And all that a resumed run may not change.
 RECORDED = ("model_revision", "dataset_name", "num_train_epochs", "max_steps", "retain")
@@ -48,7 +48,7 @@ def check_push(args: GiftTrainingArguments) -> None:
     from huggingface_hub import get_token
     from huggingface_hub.utils import validate_repo_id
 
-    if is_local(args.model_name_or_path):
+    if not is_hub_id(args.model_name_or_path):
         raise ValueError(
             "push_to_hub: model_name_or_path is a local folder, which nobody else could load; give the base's hub id"
         )
@@ -65,7 +65,7 @@ def _repository(args: GiftTrainingArguments) -> str:
 
 
 def push(folder: Path, args: GiftTrainingArguments) -> str:
-    """Upload an adapter folder (the five files of `UPLOADED`); returns the repository's id.
+    """Upload an adapter folder (its five files); returns the repository's id.
 
     OSError if that fails; the run itself is complete then, and resuming it uploads again.
     """
@@ -75,7 +75,10 @@ def push(folder: Path, args: GiftTrainingArguments) -> str:
     try:
         repository = api.create_repo(repo_id=_repository(args), private=args.hub_private_repo, exist_ok=True).repo_id
         api.upload_folder(
-            repo_id=repository, folder_path=folder, allow_patterns=UPLOADED, commit_message="GIFT adapter"
+            repo_id=repository,
+            folder_path=folder,
+            allow_patterns=sorted(ADAPTER_FILES),
+            commit_message="GIFT adapter",
         )
     except (OSError, ValueError) as error:  # HfHubHTTPError is an OSError, a malformed repository name a ValueError
         raise OSError(

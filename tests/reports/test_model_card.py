@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import tomllib
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -308,3 +309,10 @@ def test_the_dataset_card_is_valid(tmp_path):
         assert data.task_categories == ["depth-estimation"] and data.license and data.pretty_name
         assert data.to_dict()["configs"][0]["data_files"]
     assert DatasetCard.load(folder / "README.md").data.pretty_name == "My: mirrors"
+
+
+def test_the_templates_are_part_of_the_wheel():
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    folder = ROOT / "src" / "gift_peft" / "reports"
+    packed = {path for pattern in patterns["gift_peft.reports"] for path in folder.glob(pattern)}
+    assert len(packed) == 4 and packed == set(folder.rglob("*.md"))

@@ -5,7 +5,7 @@ import hashlib
 import re
 from pathlib import Path
 
-from gift_peft.files import is_hub_id
+from gift_peft.files import is_hub_id, reason
 
 
 def teacher_id(base: str | Path, revision: str | None = None) -> str:
@@ -44,7 +44,7 @@ def teacher_revision(base: str | Path, revision: str | None = None) -> str:
     try:
         config = cached_file(str(base), "config.json", revision=revision)
     except OSError as error:
-        raise FileNotFoundError(f"base model {base}: {str(error).splitlines()[0]}") from None
+        raise FileNotFoundError(f"base model {base}: {reason(error)}") from None
     return extract_commit_hash(config, None) or "unknown"
 
 

@@ -17,7 +17,7 @@ DYNAMICS = {"train_gce": "train GCE", "val_gce": "validation GCE", "booster_tom_
 RETENTION = {"val_other_rmse": "GIFT-I Other RMSE", "booster_other_rmse": "Booster Other RMSE"}
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DASHES = ("-", "--", "-.", ":")
-DIVERGED = 2.0  # times the base: such runs hide the others, so these get a plot of their own
+DIVERGED = 2.0  # times the base: next to such a run the others look flat, so they get a second plot
 
 Curve = tuple[str, list[float], list[float]]
 
@@ -67,9 +67,9 @@ def draw_dynamics(
 def draw_retention(
     runs: Sequence[tuple[str, list[dict]]], paths: Sequence[Path], width: int | None = None
 ) -> list[str]:
-    """Figure 6: error outside the target of all runs in one plot, and where some diverge a second one of the rest.
+    """Figure 6, a plot per dataset: the error outside the target of all runs; if some diverge, a second without them.
 
-    Arguments and result as in `draw_dynamics`; a plot per dataset.
+    Arguments and result as in `draw_dynamics`.
     """
     plots = []
     for key, title in RETENTION.items():
@@ -101,7 +101,7 @@ def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Pat
             for name, epochs, values in curves:
                 number = names.index(name)
                 style = {"color": COLORS[number % len(COLORS)], "linestyle": DASHES[number % len(DASHES)]}
-                # between few points a line is only a guess: they are marked
+                # a line between few points says little, so the points are marked
                 marker = "o" if len(values) < 10 else None
                 axis.plot(epochs, values, color=style["color"], alpha=0.25, linewidth=1, marker=marker)
                 axis.plot(

@@ -4,19 +4,16 @@ The record holds no path of this machine; a local base or dataset appears by its
 (`gift_peft.reports.model_card`).
 """
 
-import functools
 import platform
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
 
-from gift_peft.adapters.folder import ADAPTER_FILES
+from gift_peft.adapters.folder import ADAPTER_FILES, versions
 from gift_peft.files import is_hub_id, portable_name
 from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 
-PACKAGES = ("gift-peft", "torch", "transformers", "peft", "accelerate", "datasets")
 # And all that a resumed run may not change.
 RECORDED = ("model_revision", "dataset_name", "num_train_epochs", "max_steps", "retain")
 
@@ -30,15 +27,10 @@ def run_record(args: GiftTrainingArguments, **about) -> dict:
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{platform.machine()} CPU"
     return {
         "arguments": arguments,
-        "versions": _versions(),
+        "versions": versions(),
         "device": device,
         **about,
     }
-
-
-@functools.cache
-def _versions() -> dict[str, str]:
-    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
 
 
 def check_push(args: GiftTrainingArguments) -> None:

@@ -315,4 +315,4 @@ def test_the_templates_are_part_of_the_wheel():
     patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     folder = ROOT / "src" / "gift_peft" / "reports"
     packed = {path for pattern in patterns["gift_peft.reports"] for path in folder.glob(pattern)}
-    assert len(packed) == 4 and packed == set(folder.rglob("*.md"))
+    assert len(packed) == 5 and packed == {path for path in folder.rglob("*.*") if path.suffix in (".md", ".html")}

@@ -98,7 +98,7 @@ def test_commands_run(page, workplace):
             todo.insert(0, command)
     for command in dict.fromkeys(todo):
         run(command)
-    for left in re.findall(r"--out (\S+)", "\n".join(todo)):
+    for left in re.findall(r"--out (\S+)$", "\n".join(todo), flags=re.M):
         assert any(Path(left).iterdir()), left
 
 

@@ -25,7 +25,7 @@ OUT = Path(__file__).parents[2] / "model_cards" / "images" / "idea.png"
 
 
 def main(demo: Path) -> None:
-    model = DepthModel.from_pretrained(demo / "base")
+    model = DepthModel.from_pretrained(demo / "base", demo / "adapter")  # which knows the size of the training
     rows = [row for row in load_gift_i(demo / "gift-i", "validation") if row["group_id"].startswith(KIND)]
     photos, masks, depths = max((read(row, model) for row in rows), key=lambda group: disagreement(*group[1:])[1])
     picture, _ = disagreement(masks, depths)
@@ -59,7 +59,7 @@ def main(demo: Path) -> None:
 
 def read(row: dict, model: DepthModel) -> tuple[list, list, np.ndarray]:
     """Photos, (H, W) bool masks and (PHOTOS, H, W) depths of the observations that differ most from each other."""
-    depths = np.stack([model.depth_at(image) for image in row["images"]])
+    depths = np.stack([model.depth_at(image, base=True) for image in row["images"]])
     masks = [np.asarray(mask) > 0 for mask in row["masks"]]
     inside = np.logical_and.reduce(masks)
     order = np.argsort([depth[inside].mean() for depth in depths])

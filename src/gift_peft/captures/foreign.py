@@ -28,7 +28,7 @@ from pathlib import Path, PurePosixPath
 from gift_peft.captures.masks import MaskSource
 from gift_peft.captures.tree import Capture
 from gift_peft.files import read_yaml
-from gift_peft.images import is_image_file, natural_key
+from gift_peft.images import natural_key, sort_pictures
 from gift_peft.rules import SPLITS
 
 COLUMNS = ("image", "mask", "reference")
@@ -183,7 +183,7 @@ def _present(folder: Path, text: str, raw: Path) -> Path:
 
 
 def _pictures(folder: Path, pattern: str) -> list[Path]:
-    return sorted(filter(is_image_file, folder.glob(pattern)), key=lambda path: natural_key(path.name))
+    return sort_pictures(folder.glob(pattern))
 
 
 def _common_folder(paths: list[PurePosixPath]) -> str:

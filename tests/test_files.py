@@ -39,12 +39,13 @@ def test_a_file_stands_in_the_way_of_a_folder(tmp_path):
 
 
 def test_windows_opens_no_folders_to_sync(tmp_path, monkeypatch):
-    """os.open of a folder is PermissionError there; files are still synced."""
+    """os.open of a folder is PermissionError there; files are still synced, which takes the right to write."""
     synced, real = [], os.open
 
     def opens(path, flags, *rest):
         if os.path.isdir(path):
             raise PermissionError(13, "Permission denied", str(path))
+        assert flags & os.O_RDWR
         synced.append(os.path.basename(path))
         return real(path, flags, *rest)
 

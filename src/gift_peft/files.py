@@ -105,7 +105,7 @@ def _escaped(name: str) -> str:
 def _sync(path: Path) -> None:
     if path.is_dir() and not _OPENS_FOLDERS:
         return
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY if _OPENS_FOLDERS else os.O_RDWR)  # Windows syncs what it may write
     try:
         os.fsync(descriptor)
     finally:

@@ -163,7 +163,7 @@ def test_push_is_checked_before_anything_is_loaded(base_dir, tree, tmp_path, mon
     def never(*args):
         raise AssertionError("training had begun")
 
-    monkeypatch.setattr(loop, "Run", never)
+    monkeypatch.setattr(loop, "load_base", never)
     monkeypatch.setattr(huggingface_hub, "get_token", lambda: None)
     with pytest.raises(ValueError, match="push_to_hub: no token; run `hf auth login` or set HF_TOKEN"):
         train(GiftTrainingArguments("some/base", str(tree), str(tmp_path / "out"), push_to_hub=True))

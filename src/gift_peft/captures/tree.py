@@ -39,7 +39,6 @@ class Capture:
         masks (`list[MaskSource | None]`): one per observation; None where there is none.
         reference (`Path`, *optional*): the treated reference.
         facts (`dict`): of `group.yaml`.
-        proxies (`list[Path]`): stored predictions of the observations that come with the images (`layout.py`), or [].
     """
 
     folder: Path
@@ -49,7 +48,6 @@ class Capture:
     masks: list[MaskSource | None]
     reference: Path | None = None
     facts: dict = field(default_factory=dict)
-    proxies: list[Path] = field(default_factory=list)
 
     def name(self, path: Path) -> str:
         """How an image is called in the dataset: its path inside the group's folder."""

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from gift_peft.captures.tree import list_groups, raw_example
 from gift_peft.dataset.proxies import FORMAT, ProxyStore, default_proxies_dir
 from gift_peft.dataset.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
-from gift_peft.files import reason
+from gift_peft.files import is_hub_id, reason
 from gift_peft.images import image_digest, natural_key
 from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
@@ -218,7 +218,7 @@ def _unreadable(path: str | Path, error: BaseException) -> ValueError:
 
 
 def _load_from_hub(repository: str, split: str, revision: str | None) -> datasets.Dataset:
-    if not re.fullmatch(r"[\w.-]+(/[\w.-]+)?", repository) or Path(repository).exists():
+    if not is_hub_id(repository):
         raise FileNotFoundError(f"dataset {repository}: no such folder")
     try:
         return datasets.load_dataset(repository, split=split, features=FEATURES, revision=revision)

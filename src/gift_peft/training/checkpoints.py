@@ -22,6 +22,7 @@ from datasets import Dataset
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from gift_peft.adapters.folder import ADAPTER_WEIGHTS
 from gift_peft.dataset.gift_i import dataset_fingerprint
 from gift_peft.files import jsonable, reason, whole_folder, write_whole
 from gift_peft.models.identity import teacher_revision
@@ -32,7 +33,7 @@ CHECKSUMS = "checksums.json"
 OPTIMIZER = "optimizer.safetensors"
 RNG = "rng_state.safetensors"
 STATE = "trainer_state.json"
-NEEDED = {"adapter_model.safetensors", OPTIMIZER, RNG, STATE}
+NEEDED = {ADAPTER_WEIGHTS, OPTIMIZER, RNG, STATE}
 # Temporary names of a run: of what it replaces as a whole, of that inside a checkpoint, and of single files.
 TEMPORARY = re.compile(
     r"\.+(adapter|adapter-last|checkpoint-\d+)(\.tmp)?\.(tmp|old)|\.(metrics\.jsonl|config\.yaml)\.\d+\.partial"
@@ -138,7 +139,7 @@ def restore(
     _check_identity(before, identity)
     if state.step > total_steps:
         raise ValueError(f"resume_from_checkpoint: {checkpoint} is past the {total_steps} steps of this run")
-    result = set_peft_model_state_dict(model, load_file(checkpoint / "adapter_model.safetensors"))
+    result = set_peft_model_state_dict(model, load_file(checkpoint / ADAPTER_WEIGHTS))
     if result.unexpected_keys:
         raise ValueError(f"{checkpoint}: the adapter does not fit this model, e.g. {result.unexpected_keys[0]}")
     load_optimizer_tensors(model, optimizer, load_file(checkpoint / OPTIMIZER))

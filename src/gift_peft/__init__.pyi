@@ -23,5 +23,7 @@ from gift_peft.models.metric3d import Metric3DConfig as Metric3DConfig
 from gift_peft.models.metric3d import Metric3DForDepthEstimation as Metric3DForDepthEstimation
 from gift_peft.models.vggt import VggtConfig as VggtConfig
 from gift_peft.models.vggt import VggtForDepthEstimation as VggtForDepthEstimation
+from gift_peft.prepare.prepare import prepare_gift_i as prepare_gift_i
+from gift_peft.training.loop import train as train
 
 __version__: str

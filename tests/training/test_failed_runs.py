@@ -14,6 +14,11 @@ from gift_peft.training import checkpoints, loop, start, train
 pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
 
 
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return write_raw_tree(tmp_path_factory.mktemp("tree") / "raw", train=(2, 3, 2))
+
+
 def test_accelerates_fp16_is_refused(base_dir, tree, tmp_path, monkeypatch):
     monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", "fp16")
     with pytest.raises(ValueError, match="mixed_precision: fp16"):

@@ -5,7 +5,7 @@ import shutil
 import pytest
 import torch
 from helpers.runs import arguments, rows_of, train_again
-from helpers.tiny import write_group
+from helpers.tiny import write_group, write_raw_tree
 from safetensors import SafetensorError
 
 from gift_peft.training import checkpoints, loop, start, train

@@ -7,17 +7,19 @@ interpolation of transformers' `post_process_depth_estimation`. Values stay in t
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.colormap import color_range, colorize
 from gift_peft.files import write_whole
 from gift_peft.images import list_images, read_image
-from gift_peft.models.loading import load_model, predict_depth
 from gift_peft.models.pixels import to_pixel_values
+from gift_peft.options import OptionParser, add_adapter, add_base
+
+if TYPE_CHECKING:
+    import torch
 
 
 def predict_images(
@@ -30,7 +32,7 @@ def predict_images(
     size: str | tuple[int, int] | None = None,
     kind: str | None = None,
     revision: str | None = None,
-    device: str | torch.device | None = None,
+    device: "str | torch.device | None" = None,
     progress: bool = True,
 ) -> list[Path]:
     """Writes `<stem>.npy` and `<stem>.png` per picture and, with an adapter, `<stem>_base.npy/.png` beside them.
@@ -52,6 +54,9 @@ def predict_images(
         FileNotFoundError: a picture, base or adapter that is not there. ValueError: an unreadable picture, a
             non-finite prediction, an adapter for another base.
     """
+    from gift_peft.colormap import color_range, colorize  # not for `--help`, which needs neither OpenCV nor torch
+    from gift_peft.models.loading import load_model, predict_depth
+
     files = list_images(images)
     names = _unique_names(files, beside=adapter is not None)
     loaded = load_model(base, adapter, adapter_scale, revision, size, device)
@@ -81,8 +86,10 @@ def _write(path: Path, save: Callable[[io.BytesIO], None]) -> None:
     write_whole(path, content.getvalue())
 
 
-def _at_image_size(depth: torch.Tensor, image: Image.Image, file: Path) -> np.ndarray:
+def _at_image_size(depth: "torch.Tensor", image: Image.Image, file: Path) -> np.ndarray:
     """(1,h,w) to the picture's (H,W) as transformers does it; ValueError for NaN and infinity."""
+    import torch
+
     if not torch.isfinite(depth).all():
         raise ValueError(f"{file}: the prediction has NaN or infinite values")
     size = (image.height, image.width)
@@ -103,4 +110,33 @@ def _unique_names(files: Sequence[Path], beside: bool) -> list[str]:
     return names
 
 
-# ---- adapters ----
+# ---- the verb ----
+
+
+def make_parser() -> OptionParser:
+    parser = OptionParser(
+        "predict",
+        "Depth of pictures, beside the base's.",
+        "gift-peft predict photo.jpg --base demo/base --adapter demo/adapter --out depth",
+    )
+    parser.add_argument("images", nargs="+", metavar="IMAGE", help="picture files or folders of them")
+    add_base(parser)
+    add_adapter(parser)
+    parser.add_argument("--out", "--output-dir", required=True, metavar="DIR", help="folder for the npy and png files")
+    return parser
+
+
+def run(argv: Sequence[str]) -> int:
+    args = make_parser().parse_args(argv)
+    files = predict_images(
+        args.images,
+        args.base,
+        args.adapter,
+        args.adapter_scale,
+        out=args.out,
+        size=args.size,
+        kind=args.kind,
+        revision=args.revision,
+    )
+    print(f"Depth maps written to {args.out}: {len(files)}")
+    return 0

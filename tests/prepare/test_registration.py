@@ -5,25 +5,16 @@ import os
 import cv2
 import numpy as np
 import pytest
-from helpers.photos import motion, moved, scene, target, with_content
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from helpers.photos import SETTINGS, frames, motion, moved, scene, target, through, with_content
 from PIL import Image
 
-from gift_peft.prepare import homography
-from gift_peft.prepare.matching import Frame, RegistrationSettings
-from gift_peft.prepare.registration import difference_outside, register, valid_area, warp
+from gift_peft.prepare import registration
+from gift_peft.prepare.matching import Frame, match_frames
+from gift_peft.prepare.registration import register, valid_area, warp
+from gift_peft.prepare.settings import RegistrationSettings
 
-SETTINGS = RegistrationSettings()
 SHARED = os.path.join(os.path.dirname(__file__), "..", "..", "..", "shared", "data")
 REAL = pytest.mark.skipif(not os.path.isdir(SHARED), reason="the real photos are not beside the repository")
-
-
-def through(matrix, points):
-    """Straight-line oracle of a homography."""
-    return np.array(
-        [[(m := matrix @ np.array([x, y, 1.0]))[0] / m[2], m[1] / m[2]] for x, y in np.asarray(points, np.float64)]
-    )
 
 
 def corner_error(found, truth, frame):
@@ -107,11 +98,6 @@ def test_200_known_motions_of_real_photos(capsys):
 # ---- what must not be warped ----
 
 
-def frames(seed, size=(360, 480)):
-    picture, mask = scene(seed, size), target(seed, size)
-    return picture, mask, Frame(picture, mask, SETTINGS)
-
-
 @pytest.mark.parametrize(
     "name, truth",
     {
@@ -126,7 +112,7 @@ def test_motion_beyond_the_bound_is_dropped_and_called_that(seed, name, truth):
     rng = np.random.default_rng(seed)
     frame, there = moved(picture, mask, truth(480, 360), rng)
     result = register(Frame(frame, there, SETTINGS), fixed)
-    assert result.status == "dropped" and result.reasons[0]["code"] == "moved_too_far", result
+    assert result.status == "dropped" and result.reasons[0].code == "moved_too_far", result
 
 
 def test_featureless_frames_are_dropped_and_called_that():
@@ -140,8 +126,8 @@ def test_featureless_frames_are_dropped_and_called_that():
         bare = Frame(frame, mask, SETTINGS)
         for moving, fixed in ((bare, textured), (textured, bare)):
             result = register(moving, fixed)
-            assert result.status == "dropped" and result.reasons[0]["code"] == "featureless", result
-            assert "static_rig" in result.reasons[0]["text"]
+            assert result.status == "dropped" and result.reasons[0].code == "featureless", result
+            assert "static_rig" in result.reasons[0].text
 
 
 def test_another_scene_is_dropped_and_called_that():
@@ -149,7 +135,7 @@ def test_another_scene_is_dropped_and_called_that():
     for seed in range(4):
         _, _, fixed = frames(seed, size)
         result = register(Frame(scene(seed + 50, size), target(seed + 50, size), SETTINGS), fixed)
-        assert result.status == "dropped" and result.reasons[0]["code"] == "no_match", result
+        assert result.status == "dropped" and result.reasons[0].code == "no_match", result
 
 
 def test_a_still_camera_is_not_resampled():
@@ -159,13 +145,13 @@ def test_a_still_camera_is_not_resampled():
         frame = with_content(picture * 0.8 + 10, mask, rng)
         result = register(Frame(frame, mask, SETTINGS), fixed)
         assert result.status == "identity" and np.array_equal(result.matrix, np.eye(3))
-        assert result.figures["median_displacement"] < 0.5
+        assert result.figures.median_displacement < 0.5
 
 
 def test_a_declared_static_rig_is_not_even_measured():
     _, mask, fixed = frames(0)
     result = register(Frame(np.zeros((360, 480, 3), np.uint8), mask, SETTINGS), fixed, declared_static=True)
-    assert result.status == "identity" and result.method == "declared static"
+    assert result.status == "identity" and result.figures.method == "declared static"
 
 
 def test_a_turn_about_the_features_does_not_pass_as_standing_still():
@@ -194,8 +180,25 @@ def test_changes_inside_the_target_do_not_steer():
     assert result.status == "identity"
     exact = RegistrationSettings(paper_exact=True)
     by_the_paper = register(*(Frame(image, mask, exact) for image in noisy))
-    assert by_the_paper.figures["with_additions"]["status"] == "identity"
+    assert by_the_paper.figures.with_additions["status"] == "identity"
     assert by_the_paper.status == "dropped" or abs(by_the_paper.matrix - np.eye(3)).max() > 1e-3
+
+
+def test_frames_are_matched_by_the_paper_only_when_it_decides(monkeypatch):
+    calls = []
+
+    def counted(moving, fixed, contrast, outside_only=True):
+        calls.append("ours" if outside_only else "the paper's")
+        return match_frames(moving, fixed, contrast, outside_only)
+
+    monkeypatch.setattr(registration, "match_frames", counted)
+    picture, mask, fixed = frames(0)
+    frame = with_content(picture, mask, np.random.default_rng(0))
+    result = register(Frame(frame, mask, SETTINGS), fixed)
+    assert set(calls) == {"ours"} and result.figures.paper_exact is None
+    exact = RegistrationSettings(paper_exact=True)
+    result = register(Frame(frame, mask, exact), Frame(picture, mask, exact))
+    assert calls.count("the paper's") == 1 and result.figures.paper_exact["accepted"] is True
 
 
 def test_treated_reference_passes_by_its_pixels():
@@ -205,9 +208,9 @@ def test_treated_reference_passes_by_its_pixels():
     treated = picture.copy()
     treated[mask] = 150
     result = register(Frame(treated, mask, strict), Frame(picture, mask, strict), treated=True)
-    assert result.status == "identity" and result.method == "pixels" and result.warnings[0]["code"] == "by_pixels"
+    assert result.status == "identity" and result.figures.method == "pixels" and result.warnings[0].code == "by_pixels"
     exact = RegistrationSettings(paper_exact=True)  # the paper leaves references alone
-    assert register(Frame(treated, mask, exact), Frame(picture, mask, exact), treated=True).method == "paper"
+    assert register(Frame(treated, mask, exact), Frame(picture, mask, exact), treated=True).figures.method == "paper"
     other = register(Frame(scene(9, (360, 480)), mask, strict), Frame(picture, mask, strict), treated=True)
     assert other.status == "dropped"
 
@@ -228,7 +231,7 @@ def test_settings_are_obeyed():
     ):
         other = RegistrationSettings(**{name: value})
         result = register(Frame(frame, there, other), Frame(picture, mask, other))
-        assert result.status == "dropped" and code in [item["code"] for item in result.reasons], (name, result)
+        assert result.status == "dropped" and code in [item.code for item in result.reasons], (name, result)
     still = RegistrationSettings(identity_displacement=20)
     assert register(Frame(frame, there, still), Frame(picture, mask, still)).status in ("identity", "warped")
 
@@ -257,7 +260,7 @@ def test_booster_illuminations_are_identity():
     ]
     for index in (0, 1):
         result = register(photos[index], photos[2])
-        assert result.status == "identity" and result.figures["median_displacement"] < 0.1, result
+        assert result.status == "identity" and result.figures.median_displacement < 0.1, result
 
 
 @REAL
@@ -283,118 +286,3 @@ def test_two_views_are_not_one():
         for side in ("left", "right")
     )
     assert register(right, left).status == "dropped"
-
-
-# ---- the mathematics ----
-
-
-def some_map(rng, size):
-    return motion(rng, size, translation=20, degrees=5, perspective=1e-4)
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**31))
-def test_points_fit_recovers_the_map_despite_outliers(seed):
-    rng = np.random.default_rng(seed)
-    truth = some_map(rng, (480, 640))
-    fixed = rng.uniform(0, [640, 480], (80, 2))
-    moving = through(truth, fixed) + rng.normal(0, 0.1, (80, 2))
-    moving[:12] += rng.uniform(5, 40, (12, 2))
-    start = cv2.findHomography(fixed, moving, cv2.RANSAC, 3.0)[0]
-    fit = homography.fit_points(fixed, moving, start, (640, 480))
-    corners = homography.corners_of(640, 480)
-    assert np.linalg.norm(through(fit.matrix, corners) - through(truth, corners), axis=1).max() < 0.6
-    assert 0.03 < fit.sigma < 0.3
-
-
-def test_expected_error_is_what_repetition_shows():
-    # Features at the left, the target at the right: the spread of the fitted corners over many draws.
-    truth = motion(np.random.default_rng(3), (480, 640))
-    corners = np.array([[560.0, 200], [620, 200], [620, 260], [560, 260]])
-    found, expected = [], []
-    for seed in range(120):
-        rng = np.random.default_rng(seed)
-        fixed = rng.uniform([0, 0], [320, 480], (60, 2))
-        moving = through(truth, fixed) + rng.normal(0, 0.3, (60, 2))
-        fit = homography.fit_points(fixed, moving, truth, (640, 480))
-        found.append(through(fit.matrix, corners))
-        expected.append(fit.expected_error(corners))
-    spread = np.sqrt(np.var(found, axis=0).sum(axis=1)).max()
-    assert 0.6 < np.median(expected) / spread < 1.6, (np.median(expected), spread)
-
-
-def test_pixel_fit_is_subpixel_and_deaf_to_the_light():
-    rng = np.random.default_rng(0)
-    picture = scene(4)
-    truth = motion(rng, (480, 640), translation=3, degrees=0.3)
-    frame = cv2.warpPerspective(picture, truth, (640, 480), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    light = np.linspace(0.6, 1.1, 640)[None, :]  # brighter to the right
-    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (picture, frame)]
-    everywhere = np.ones((480, 640), bool)
-    fixed, moving = (homography.pyramid(image.astype(np.uint8), everywhere) for image in (gray[0], gray[1] * light))
-    fit = homography.fit_pixels(fixed, moving, np.eye(3))
-    corners = homography.corners_of(640, 480)
-    assert np.linalg.norm(through(fit.matrix, corners) - through(truth, corners), axis=1).max() < 0.2
-    assert fit.correlation > 0.8
-    noise = homography.pyramid(rng.integers(0, 255, (480, 640), dtype=np.uint8), everywhere)
-    other = homography.fit_pixels(fixed, noise, np.eye(3))
-    assert other is None or other.correlation < 0.5
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2**31))
-def test_displacement_and_distortion_against_the_oracle(seed):
-    rng = np.random.default_rng(seed)
-    matrix = some_map(rng, (480, 640))
-    points = rng.uniform(0, [640, 480], (5, 2))
-    moves = np.linalg.norm(through(matrix, points) - points, axis=1)
-    assert homography.displacement(matrix, points) == pytest.approx(moves.max())
-    stretched = 0.0
-    for point in points:  # central differences
-        local = np.stack(
-            [
-                (through(matrix, [point + step])[0] - through(matrix, [point - step])[0]) / 2e-3
-                for step in np.eye(2) / 1e3
-            ]
-        ).T
-        stretched = max(stretched, np.abs(np.linalg.svd(local, compute_uv=False) - 1).max())
-    assert homography.distortion(matrix, points) == pytest.approx(stretched, rel=1e-3, abs=1e-6)
-
-
-def test_degenerate_maps_are_infinitely_distorted():
-    corners = homography.corners_of(640, 480)
-    horizon = np.array([[1, 0, 0], [0, 1, 0], [-1 / 300, 0, 1]])
-    for matrix in (horizon, np.diag([-1.0, 1, 1]), np.full((3, 3), np.nan)):
-        assert homography.distortion(matrix, corners) == np.inf
-    to_infinity = np.array([[1, 0, 0], [0, 1, 0], [-1 / 639, 0, 1]])  # the right border
-    assert homography.displacement(to_infinity, corners) == np.inf
-
-
-def test_valid_area_and_warp_against_the_oracle():
-    rng = np.random.default_rng(2)
-    matrix = some_map(rng, (40, 60))
-    picture = rng.integers(0, 255, (40, 60, 3), dtype=np.uint8)
-    mask = rng.random((40, 60)) < 0.5
-    valid, warped, warped_mask = valid_area(matrix, (60, 40)), warp(picture, matrix), warp(mask, matrix)
-    assert warped_mask.dtype == bool
-    back = np.linalg.inv(matrix)
-    for y in range(40):
-        for x in range(60):
-            (u, v), inside = through(back, [[x, y]])[0], valid[y, x]
-            assert inside == (0 <= u <= 59 and 0 <= v <= 39)
-            if inside and min(abs(u % 1 - 0.5), abs(v % 1 - 0.5)) > 0.05:
-                assert warped_mask[y, x] == mask[round(v), round(u)]
-            if inside:
-                left, top = min(int(u), 58), min(int(v), 38)
-                a, b = u - left, v - top
-                around = picture[top : top + 2, left : left + 2].astype(float)
-                expected = (around[0] * [[1 - a], [a]]).sum(0) * (1 - b) + (around[1] * [[1 - a], [a]]).sum(0) * b
-                assert np.abs(warped[y, x] - expected).max() < 10
-
-
-def test_difference_outside_ignores_the_target_and_the_exposure():
-    picture, mask, fixed = frames(6)
-    darker = (picture * 0.7).astype(np.uint8)
-    darker[mask] = 255
-    before, after = difference_outside(Frame(darker, mask, SETTINGS), fixed, np.eye(3))
-    assert before == after < 0.6

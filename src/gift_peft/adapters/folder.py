@@ -6,8 +6,10 @@ The folder is whole or absent. For Depth Anything it loads with peft and transfo
 from __future__ import annotations
 
 import copy
+import functools
 import json
 import math
+import platform
 import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -18,7 +20,7 @@ from peft import LoraConfig, PeftConfig, PeftModel
 from peft.tuners.lora import LoraLayer
 
 from gift_peft.adapters.scale import active_lora, active_saved_modules
-from gift_peft.files import jsonable, reason, whole_folder
+from gift_peft.files import is_hub_id, jsonable, reason, whole_folder
 
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
@@ -61,7 +63,7 @@ def save_adapter(
     base = base_model_name_or_path or _base_name(model)
     hub_base = _hub_name(base, card)
     with whole_folder(folder) as temporary:
-        model.save_pretrained(temporary, selected_adapters=["default"], save_embedding_layers=False)
+        model.save_pretrained(str(temporary), selected_adapters=["default"], save_embedding_layers=False)
         config = json.loads((temporary / ADAPTER_CONFIG).read_text())
         config.update(base_model_name_or_path=base, revision=revision)
         _write_json(temporary / ADAPTER_CONFIG, config)
@@ -86,8 +88,8 @@ def _base_name(model: PeftModel) -> str | None:
 
 
 def _hub_name(base: str | None, card: str | None) -> str | None:
-    """`base` if it may stand in a card: not a path of this machine."""
-    if base is None or not Path(base).exists():
+    """`base` if it may stand in a card: a hub id, not a path of this machine."""
+    if base is None or is_hub_id(base):
         return base
     warnings.warn(
         f"the base is the local folder {base}: others cannot load this adapter by its base's name; "
@@ -119,12 +121,14 @@ def _at_size(processor: Any, size: tuple[int, int] | None) -> Any:
 
 
 def _gift_json(gift: Mapping[str, Any] | None, size: tuple[int, int] | None) -> dict[str, Any]:
-    packages = ("gift-peft", "torch", "transformers", "peft", "accelerate")
-    return {
-        "versions": {name: version(name) for name in packages},
-        "size": size,
-        **(gift or {}),
-    }
+    return {"versions": versions(), "size": size, **(gift or {})}
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """Of what an adapter was made with: this package, those it uses, and Python."""
+    packages = ("gift-peft", "torch", "transformers", "peft", "accelerate", "datasets")
+    return {name: version(name) for name in packages} | {"python": platform.python_version()}
 
 
 def _minimal_card(hub_base: str | None) -> str:
@@ -153,7 +157,7 @@ def read_adapter_config(adapter: str | Path) -> LoraConfig:
         _read_object(adapter, ADAPTER_CONFIG)
     where = f"adapter {adapter}: damaged {ADAPTER_CONFIG}"
     try:
-        config = PeftConfig.from_pretrained(adapter)
+        config = PeftConfig.from_pretrained(str(adapter))
     except (KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ValueError(f"{where} ({reason(error)})") from None
     except (OSError, ValueError) as error:

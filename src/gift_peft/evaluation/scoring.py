@@ -18,7 +18,6 @@ from gift_peft.evaluation.metrics import METRICS, depth_metrics
 from gift_peft.evaluation.predictors import Predictor
 from gift_peft.evaluation.protocols import Protocol
 from gift_peft.evaluation.results import REGIONS
-from gift_peft.images import to_mask
 from gift_peft.losses import GeometryConsistencyError, prediction_spread, require_finite
 
 NO_PROXY, NO_DEPTH = "without a treated reference", "without true depth"  # why a row is skipped
@@ -119,18 +118,16 @@ def references(row: Any, group: Group, task: Task) -> tuple[Sequence, list[np.nd
             target = task.teacher(group.reference_pixel_values)[0]
             require_finite(target[None], f"group {group.group_id}: the frozen prediction", ["the treated reference"])
         return [None if target is None else target.numpy()] * len(masks), masks, valids
-    if group.depths is None:
-        return [None] * len(masks), masks, valids
-    if isinstance(row, Group):
+    pictures = group.pictures
+    if pictures is None:
         raise ValueError('reference="depth" needs the rows of load_gift_i: a Group has no masks at the depth\'s size')
+    if not pictures.depths:
+        return [None] * len(masks), masks, valids
     # On the depth's own grid, where the masks were drawn (one size per group).
-    label = [f"group {group.group_id}, image {name}" for name in group.names]
-    masks = [to_mask(mask, f"{at}: its mask") for mask, at in zip(row["masks"], label, strict=True)]
-    valids = [to_mask(mask, f"{at}: its valid mask") for mask, at in zip(row.get("valids") or [], label, strict=False)]
     return (
-        [depth.numpy() for depth in group.depths],
-        masks,
-        valids or [np.ones(mask.shape, bool) for mask in masks],
+        [depth.astype(np.float32) for depth in pictures.depths],
+        pictures.masks,
+        pictures.valids or [np.ones(mask.shape, bool) for mask in pictures.masks],
     )
 
 

@@ -5,7 +5,7 @@ import hashlib
 import re
 from pathlib import Path
 
-from gift_peft.files import reason
+from gift_peft.files import is_hub_id, reason
 
 
 def teacher_id(base: str | Path, revision: str | None = None) -> str:
@@ -19,13 +19,8 @@ def teacher_id(base: str | Path, revision: str | None = None) -> str:
 
 def check_base_name(base: str | Path) -> None:
     """Raise FileNotFoundError unless `base` is a folder or could be a hub id."""
-    from huggingface_hub.utils import validate_repo_id
-
-    if not Path(base).is_dir():
-        try:
-            validate_repo_id(str(base))
-        except ValueError:
-            raise FileNotFoundError(f"base model {base}: no such folder") from None
+    if not Path(base).is_dir() and not is_hub_id(base):
+        raise FileNotFoundError(f"base model {base}: no such folder")
 
 
 def teacher_revision(base: str | Path, revision: str | None = None) -> str:
@@ -42,8 +37,7 @@ def teacher_revision(base: str | Path, revision: str | None = None) -> str:
         stats = tuple((str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files)
         return f"sha256:{_digest_files(stats)}"
 
-    from transformers.utils import cached_file
-    from transformers.utils.hub import extract_commit_hash
+    from transformers.utils.hub import cached_file, extract_commit_hash
 
     check_base_name(base)
     try:

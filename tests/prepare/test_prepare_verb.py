@@ -1,0 +1,67 @@
+"""The options of `gift-peft prepare`: every field of the settings, with its text and its default in the help."""
+
+import ast
+import inspect
+import re
+from dataclasses import fields
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import gift_peft.prepare
+from gift_peft.prepare.prepare import prepare_gift_i
+from gift_peft.prepare.prepare_verb import PARTS
+from gift_peft.prepare.prepare_verb import parse_arguments as parse
+from gift_peft.prepare.settings import PrepareSettings
+
+PACKAGE = Path(gift_peft.prepare.__file__).parent
+
+
+def settings(*argv):
+    return parse(["R", *argv, "O"]).settings
+
+
+@pytest.mark.parametrize("spell", [str, lambda name: name.replace("_", "-")])
+def test_every_field_is_an_option(tmp_path, spell):
+    assert settings() == PrepareSettings()
+    for part, kind in PARTS.items():
+        for f in fields(kind):
+            option = f"--{spell(f.name)}"
+            if isinstance(f.default, bool):
+                assert getattr(getattr(settings(option), part), f.name) is True
+                assert settings(option, f"--{spell('no_' + f.name)}") == PrepareSettings()
+            else:
+                value = 0.5 if f.name == "confidence" else f.default * 2
+                assert settings(option, str(value)) == PrepareSettings(**{part: kind(**{f.name: value})})
+    for name in ("static_rig", "propose_masks", "accept_proposed_masks"):
+        assert getattr(settings(f"--{spell(name)}"), name) is True
+        assert getattr(settings(f"--{spell(name)}", f"--{spell('no_' + name)}"), name) is False
+    layout = tmp_path / "layout.yaml"
+    layout.write_text("root: release")
+    args = parse(["R", "O", f"--{spell('pretty_name')}=A b", "--layout", str(layout), "--refine", "sam2:x"])
+    assert args.pretty_name == "A b" and args.settings.layout.root == "release" and args.settings.propose_masks
+    assert set(vars(args)) <= inspect.signature(prepare_gift_i).parameters.keys()
+
+
+def test_help_says_every_option_its_default_and_an_example(capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse(["--help"])
+    words = " ".join(capsys.readouterr().out.split())
+    assert ended.value.code == 0 and "example: gift-peft prepare" in words and "--static_rig" not in words
+    for f in (f for kind in PARTS.values() for f in fields(kind)):
+        assert f.metadata["help"] in words
+        assert re.search(rf"--{f.name.replace('_', '-')}[ ,]", words)
+        if not isinstance(f.default, bool):
+            assert f"{f.metadata['help']} (default: {f.default})" in words
+
+
+def test_no_circle_among_the_modules_of_prepare():
+    """Imports inside functions count too."""
+    graph = {}
+    for path in PACKAGE.glob("*.py"):
+        imported = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        names = [node.module for node in imported if (node.module or "").startswith("gift_peft.prepare.")]
+        graph[f"gift_peft.prepare.{path.stem}"] = set(names)
+    assert len(graph) > 10 and graph["gift_peft.prepare.prepare"]
+    list(TopologicalSorter(graph).static_order())  # a CycleError names the circle

@@ -12,6 +12,7 @@ from gift_peft.models import register_models
 __version__ = "0.1.0"
 
 _HOME = {
+    "DepthModel": "models.loading",
     "GeometryConsistencyError": "losses",
     "GiftI": "dataset.gift_i",
     "GiftRecipe": "adapters.recipes",

@@ -95,6 +95,9 @@ def _parser() -> argparse.ArgumentParser:
     predict.add_argument("images", nargs="+", metavar="IMAGE", help="picture files or folders of them")
     _add_model(predict)
     _add_adapter(predict)
+    predict.add_argument(
+        "--focal-length", type=float, metavar="PIXELS", help="of the camera that took the pictures, for Metric3D"
+    )
     predict.add_argument("--out", required=True, help="folder for the npy and png files")
     report = verb("report", _report, "tables, figures and model card of runs, from what they left behind")
     report.add_argument("runs", nargs="+", metavar="RUN", help="folder of a run or of an evaluation")
@@ -263,6 +266,7 @@ def _predict(args: argparse.Namespace, rest: list[str]) -> int:
         size=args.size,
         kind=args.kind,
         revision=args.revision,
+        focal_length=args.focal_length,
     )
     print(f"Depth maps written to {args.out}: {len(files)}")
     return 0

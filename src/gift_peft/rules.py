@@ -8,6 +8,7 @@ from PIL import Image
 
 SPLITS = ("train", "validation")
 SURFACES = ["mirror", "transparent"]
+KINDS = ("depth", "inverse_depth")  # what a model predicts
 
 
 def label_items(group_id: str, names: Sequence[str], kind: str, items: Sequence | None, optional: bool = False):

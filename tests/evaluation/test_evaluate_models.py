@@ -127,8 +127,9 @@ def test_two_processes_give_the_report_of_one(tmp_path):
 
 def test_paths_and_model_ids_are_accepted(raw_tree, base_dir, tmp_path):
     other = write_base(tmp_path / "other", seed=1)
-    from gift_peft.models.loading import load_model
+    from gift_peft.models.loading import DepthModel
 
-    report = evaluate_gift_i(raw_tree, load_model(other, size=SIZE).model, str(base_dir), size=SIZE, progress=False)
+    model = DepthModel.from_pretrained(other).network
+    report = evaluate_gift_i(raw_tree, model, str(base_dir), size=SIZE, progress=False)
     expected = evaluate_gift_i(raw_tree, tiny_model(), processor=tiny_processor(), size=SIZE, progress=False)
     assert report.base == expected.base and report.summary != report.base

@@ -17,7 +17,7 @@ from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.evaluation.results import GiftIReport
 from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.files import write_whole
-from gift_peft.models.loading import load_model
+from gift_peft.models.loading import DepthModel
 from gift_peft.reports.figures import before_after
 from gift_peft.reports.model_card import run_length
 from gift_peft.reports.panels import group_panels
@@ -73,22 +73,15 @@ def run_demo(
     if result.signal:
         raise KeyboardInterrupt
 
-    loaded = load_model(out / "base", out / "adapter")
+    model = DepthModel.from_pretrained(out / "base", out / "adapter")
     groups = load_gift_i(out / "gift-i", "validation")
     reports = {}
     for reference in ("proxy", "depth"):
-        report = evaluate_gift_i(
-            groups,
-            loaded.model,
-            reference=reference,
-            processor=loaded.processor,
-            size=loaded.size,
-            kind=loaded.kind,
-        )
+        report = evaluate_gift_i(groups, model, reference=reference)
         report.about = {"base": f"{out}/base", "adapter": f"{out}/adapter", "dataset": f"{out}/gift-i", "seed": seed}
         report.save(out / f"evaluation-{reference}")
         reports[reference] = report
-    before_after(_panels(groups, reports["depth"], loaded), out / "before_after.png")
+    before_after(_panels(groups, reports["depth"], model), out / "before_after.png")
     write_whole(out / "report.md", _markdown(reports, args))
     _print_summary(reports, out)
     return reports
@@ -112,7 +105,7 @@ def _scored(report: GiftIReport, kind: str) -> list[dict]:
     return [row for row in report.rows if row["group_id"].startswith(kind) and not row["skipped"]]
 
 
-def _panels(groups, report: GiftIReport, loaded) -> list:
+def _panels(groups, report: GiftIReport, model: DepthModel) -> list:
     """For each kind of target the observation on which the base errs most inside it: the worst hallucination."""
     rows = {
         row["group_id"]: (index, row) for index, row in enumerate(groups.select_columns(["group_id", "image_names"]))
@@ -122,14 +115,8 @@ def _panels(groups, report: GiftIReport, loaded) -> list:
         own = _scored(report, kind)
         worst = max(own, key=lambda row: row["base"]["tom"]["rmse"])
         index, names = rows[worst["group_id"]]
-        panels += group_panels(
-            groups[index],
-            {names["image_names"].index(worst["image"]): label},
-            loaded.model,
-            processor=loaded.processor,
-            size=loaded.size,
-            kind=loaded.kind,
-        )
+        labels = {names["image_names"].index(worst["image"]): label}
+        panels += group_panels(groups[index], labels, model)
     return panels
 
 

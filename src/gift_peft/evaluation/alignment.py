@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from gift_peft.evaluation.fitting import fit, nearest_to_grid
-from gift_peft.evaluation.protocols import KINDS, Protocol, get_protocol
+from gift_peft.evaluation.protocols import Protocol, get_protocol
+from gift_peft.rules import KINDS
 
 
 @dataclass(frozen=True)

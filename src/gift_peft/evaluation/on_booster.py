@@ -16,15 +16,7 @@ import torch
 from tqdm import tqdm
 
 from gift_peft.evaluation.booster_scenes import TOM_CLASSES, BoosterScene, GroundTruth, find_booster, read_ground_truth
-from gift_peft.evaluation.predictors import (
-    Predictor,
-    evaluating,
-    make_predictors,
-    network_size,
-    own_processor,
-    to_millimetres,
-)
-from gift_peft.evaluation.protocols import KINDS, Protocol, get_protocol
+from gift_peft.evaluation.protocols import Protocol, get_protocol
 from gift_peft.evaluation.results import (
     BoosterReport,
     count_rows,
@@ -33,12 +25,20 @@ from gift_peft.evaluation.results import (
     summarize,
     summarize_gce,
 )
-from gift_peft.evaluation.scoring import NO_DEPTH, Scorer, native_statistics, resize_prediction
+from gift_peft.evaluation.scoring import (
+    NO_DEPTH,
+    Predictor,
+    Scorer,
+    native_statistics,
+    predictors_of,
+    resize_prediction,
+)
 from gift_peft.evaluation.stored_predictions import PredictionFolder
 from gift_peft.images import read_image
 from gift_peft.losses import GeometryConsistencyError, require_finite
-from gift_peft.models.loading import prediction_kind
-from gift_peft.models.pixels import resize_mask, to_pixel_values
+from gift_peft.models.loading import DepthModel
+from gift_peft.models.pixels import resize_mask
+from gift_peft.rules import KINDS
 
 SCENE_PIXELS = 2**20  # of a prediction kept for GCE and spread; a quarter of Booster's size has fewer
 
@@ -106,34 +106,35 @@ def evaluate_booster(
     if rules.resolution not in (None, resize):
         warnings.warn(f"protocol {rules.name} is meant for x{rules.resolution:g}, not x{resize:g}", stacklevel=2)
     rules = replace(rules, resolution=resize)
-    kind = _kind(kind, model, rules)
-    booster = find_booster(root, subset, official)
+    fits_no_scale = rules.dof in ("none", "shift")
     if predictions is None:
-        predictors, _ = make_predictors(model, teacher, baseline, batch_size)
-        models = list(predictors)
-        processor = processor or own_processor(model)
-        predict = _from_models(predictors, processor, network_size(size, model, processor))
+        model = DepthModel.of(model, teacher=teacher, processor=processor, size=size, kind=kind)
+        kind = model.known_kind()
+        booster = find_booster(root, subset, official)
+        predictors = predictors_of(model, baseline, batch_size)
+        predict, models = _from_models(model, predictors), list(predictors)
+        prediction_scale = prediction_scale or (model.millimeters_per_unit if fits_no_scale else 1.0)
     else:
-        models = ["base"]
+        kind = _stored_kind(kind, rules)
+        booster = find_booster(root, subset, official)
         stored = PredictionFolder(predictions, prediction_scale)
-        stored.check(booster.scenes, needs_scale=rules.dof in ("none", "shift"))
-        predict, prediction_scale = _from_files(stored), 1.0
-    task = BoosterTask(predict, models, rules, kind, prediction_scale or to_millimetres(model, rules))
+        stored.check(booster.scenes, needs_scale=fits_no_scale)
+        predict, models, prediction_scale = _from_files(stored), ["base"], 1.0
+    task = BoosterTask(predict, models, rules, kind, prediction_scale)
 
     rank, world = (accelerator.process_index, accelerator.num_processes) if accelerator else (0, 1)
     results = []
-    with evaluating(model, teacher):
-        bar = tqdm(
-            total=sum(len(scene.images) for scene in booster.scenes[rank::world]),
-            desc="evaluate Booster",
-            unit="image",
-            disable=None if progress and rank == 0 else True,
-        )
-        with bar:
-            for index in range(rank, len(booster.scenes), world):
-                scene = booster.scenes[index]
-                truth = read_ground_truth(scene, resize, occlusion, tom_classes)
-                results.append((index, *_evaluate_scene(scene, truth, task, bar)))
+    bar = tqdm(
+        total=sum(len(scene.images) for scene in booster.scenes[rank::world]),
+        desc="evaluate Booster",
+        unit="image",
+        disable=None if progress and rank == 0 else True,
+    )
+    with bar:
+        for index in range(rank, len(booster.scenes), world):
+            scene = booster.scenes[index]
+            truth = read_ground_truth(scene, resize, occlusion, tom_classes)
+            results.append((index, *_evaluate_scene(scene, truth, task, bar)))
     if world > 1:
         from accelerate.utils import gather_object
 
@@ -164,21 +165,20 @@ class BoosterTask:
     prediction_scale: float
 
 
-def _kind(kind: str | None, model: Any, rules: Protocol) -> str:
-    if kind not in (None, *KINDS):
+def _stored_kind(kind: str | None, rules: Protocol) -> str:
+    kind = kind or rules.expects
+    if kind is None:
+        raise ValueError('say what the predictions are: kind="depth" or kind="inverse_depth"')
+    if kind not in KINDS:
         raise ValueError(f"unknown kind {kind!r}: choose one of {', '.join(KINDS)}")
-    if kind is None and model is None:
-        kind = rules.expects
-        if kind is None:
-            raise ValueError('say what the predictions are: kind="depth" or kind="inverse_depth"')
-    return kind or prediction_kind(model)
+    return kind
 
 
-def _from_models(predictors: dict[str, Predictor], processor: Any, size: tuple[int, int]) -> ScenePredictor:
+def _from_models(model: DepthModel, predictors: dict[str, Predictor]) -> ScenePredictor:
     """Predictions at the network's size; the scene's pictures are opened one at a time."""
 
     def predict(scene: BoosterScene, truth: GroundTruth) -> Iterator[dict[str, torch.Tensor]]:
-        pixels = torch.cat([to_pixel_values([_read_image(path, truth)], processor, size) for path in scene.images])
+        pixels = torch.cat([model.inputs([_read_image(path, truth)]) for path in scene.images])
         maps = {name: predictor(pixels) for name, predictor in predictors.items()}
         for name, depth in maps.items():
             if depth.ndim != 3 or len(depth) != len(scene.images):

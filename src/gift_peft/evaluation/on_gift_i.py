@@ -5,7 +5,6 @@ model's prediction on the treated reference, or true depth) and scored per regio
 The consensus is the base with its target replaced by the group's per-pixel median: what Eq. 3 pulls towards.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,6 @@ from tqdm import tqdm
 
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.tensors import Group, collate_group
-from gift_peft.evaluation.predictors import (
-    evaluating,
-    make_predictors,
-    network_size,
-    own_processor,
-    to_millimetres,
-)
 from gift_peft.evaluation.protocols import Protocol, get_protocol
 from gift_peft.evaluation.results import (
     GiftIReport,
@@ -31,8 +23,8 @@ from gift_peft.evaluation.results import (
     summarize,
     summarize_gce,
 )
-from gift_peft.evaluation.scoring import NO_DEPTH, Task, evaluate_group
-from gift_peft.models.loading import prediction_kind
+from gift_peft.evaluation.scoring import NO_DEPTH, Task, evaluate_group, predictors_of
+from gift_peft.models.loading import DepthModel
 
 REFERENCES = {"proxy": "native", "depth": "gift"}  # and the protocol that goes with each
 
@@ -89,32 +81,35 @@ def evaluate_gift_i(
         raise ValueError("evaluate_gift_i needs a model")
     if isinstance(dataset, str | Path):
         dataset = load_gift_i(dataset, "validation")
+    if size is None and not isinstance(model, DepthModel):
+        size = _proxies_size(dataset)
+    model = DepthModel.of(model, teacher=teacher, processor=processor, size=size, kind=kind)
     rules = replace(get_protocol(protocol or REFERENCES[reference]), resolution=1.0)  # on the reference's own grid
     if reference == "proxy" and rules.space != "native":
         raise ValueError(
             f'protocol {rules.name} aligns to depth in {rules.unit}; proxies are in native units: use "native", or '
             'reference="depth"'
         )
-    if kind is None:
-        # Against proxies nothing is ever inverted, so a callable without a recipe need not say what it predicts.
-        kind = "depth" if reference == "proxy" else prediction_kind(model)
+    # Against proxies nothing is ever inverted, so a callable without a recipe need not say what it predicts.
+    kind = model.kind or "depth" if reference == "proxy" else model.known_kind()
     if reference == "depth" and rules.space == "native" and kind == "inverse_depth":
         raise ValueError(f'protocol {rules.name} would fit inverse depth straight to depth; use "gift"')
-    predictors, frozen = make_predictors(model, teacher, baseline, batch_size)
+    predictors = predictors_of(model, baseline, batch_size)
     models = [*predictors, *(["consensus"] if "base" in predictors else [])]
-    task = Task(predictors, frozen, models, rules, reference, kind, prediction_scale or to_millimetres(model, rules))
+    scale = prediction_scale or (model.millimeters_per_unit if rules.dof in ("none", "shift") else 1.0)
+    task = Task(predictors, model, models, rules, reference, kind, scale)
 
     rank, world = (accelerator.process_index, accelerator.num_processes) if accelerator else (0, 1)
-    prepare = group_collator(dataset, model, processor, size)
     results = []
-    with evaluating(model, teacher):
-        for index in tqdm(
-            range(rank, len(dataset), world),
-            desc="evaluate",
-            unit="group",
-            disable=None if progress and rank == 0 else True,
-        ):
-            results.append((index, *evaluate_group(dataset[index], prepare, task)))
+    for index in tqdm(
+        range(rank, len(dataset), world),
+        desc="evaluate",
+        unit="group",
+        disable=None if progress and rank == 0 else True,
+    ):
+        row = dataset[index]
+        group = row if isinstance(row, Group) else collate_group(row, model.processor, model.size)
+        results.append((index, *evaluate_group(row, group, task)))
     if world > 1:
         from accelerate.utils import gather_object
 
@@ -129,17 +124,13 @@ def evaluate_gift_i(
     return _report(groups, rows, task)
 
 
-def group_collator(dataset: Any, model: Any, processor: Any, size: Any) -> Callable[[dict], Group]:
-    """Rows to groups, at the size of the stored proxies where there are any."""
+def _proxies_size(dataset: Any) -> tuple[int, int] | None:
+    """(height, width) of the proxies attached to a dataset, if there are any."""
     first = dataset[0] if len(dataset) else None
     if first is None or isinstance(first, Group):
-        return lambda group: group
-    processor = processor or own_processor(model)
-    for name in ("proxies", "reference_proxy"):
-        if size is None and first.get(name) is not None:
-            size = np.asarray(first[name]).shape[-2:]
-    size = network_size(size, model, processor)
-    return lambda row: collate_group(row, processor, size)
+        return None
+    proxies = [first[name] for name in ("proxies", "reference_proxy") if first.get(name) is not None]
+    return tuple(np.asarray(proxies[0]).shape[-2:]) if proxies else None
 
 
 def _report(groups: list[dict], rows: list[dict], task: Task) -> GiftIReport:

@@ -7,7 +7,8 @@ are what published evaluators do, so that numbers can be compared with theirs.
 
 from dataclasses import asdict, dataclass
 
-KINDS = ("depth", "inverse_depth")
+from gift_peft.rules import KINDS
+
 # A choice that nothing computes must not stand under a table.
 CHOICES = {
     "space": ("auto", "depth", "inverse", "native"),

@@ -5,6 +5,7 @@ All of it on the CPU in float64, image by image, so that a row does not depend o
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -15,13 +16,23 @@ from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.alignment import align, known, to_numpy
 from gift_peft.evaluation.fitting import DegenerateFitError
 from gift_peft.evaluation.metrics import METRICS, depth_metrics
-from gift_peft.evaluation.predictors import Predictor
 from gift_peft.evaluation.protocols import Protocol
 from gift_peft.evaluation.results import REGIONS
 from gift_peft.images import to_mask
 from gift_peft.losses import GeometryConsistencyError, prediction_spread, require_finite
+from gift_peft.models.loading import DepthModel
+
+Predictor = Callable[[torch.Tensor], torch.Tensor]
 
 NO_PROXY, NO_DEPTH = "without a treated reference", "without true depth"  # why a row is skipped
+
+
+def predictors_of(model: DepthModel, baseline: bool, batch_size: int) -> dict[str, Predictor]:
+    """Base and adapted as functions of pixel values, where there is an adapter or a teacher; else the base alone."""
+    own, frozen = (partial(run, batch_size=batch_size) for run in (model.predict, model.predict_base))
+    if not model.adapted:
+        return {"base": own}
+    return {"base": frozen, "adapted": own} if baseline else {"adapted": own}
 
 
 @dataclass
@@ -29,7 +40,7 @@ class Task:
     """The choices of one evaluation, the same for every group."""
 
     predictors: dict[str, Predictor]
-    teacher: Predictor
+    model: DepthModel
     models: list[str]
     protocol: Protocol
     reference: str
@@ -37,9 +48,8 @@ class Task:
     prediction_scale: float = 1.0
 
 
-def evaluate_group(row: Any, prepare: Callable[[Any], Group], task: Task) -> tuple[dict, list[dict]]:
-    """The group's GCE and its rows."""
-    group = prepare(row)
+def evaluate_group(row: Any, group: Group, task: Task) -> tuple[dict, list[dict]]:
+    """The GCE of a row's group, and its rows."""
     predictions = {name: predict(group.pixel_values) for name, predict in task.predictors.items()}
     for name, prediction in predictions.items():
         _check_prediction(prediction, group, name)
@@ -116,7 +126,7 @@ def references(row: Any, group: Group, task: Task) -> tuple[Sequence, list[np.nd
     if task.reference == "proxy":
         target = group.reference_target
         if target is None and group.reference_pixel_values is not None:
-            target = task.teacher(group.reference_pixel_values)[0]
+            target = task.model.predict_base(group.reference_pixel_values)[0]
             require_finite(target[None], f"group {group.group_id}: the frozen prediction", ["the treated reference"])
         return [None if target is None else target.numpy()] * len(masks), masks, valids
     if group.depths is None:

@@ -14,7 +14,7 @@ from gift_peft.evaluation.results import (
 )
 from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.files import write_whole
-from gift_peft.models.loading import load_model
+from gift_peft.models.loading import DepthModel
 
 
 def run_evaluation(
@@ -38,16 +38,13 @@ def run_evaluation(
     progress: bool = True,
 ) -> GiftIReport:
     """`gift-peft evaluate`: loads, evaluates, prints the table, writes `metrics.json`, `rows.jsonl`, `report.md`."""
-    loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
+    model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
     groups = load_gift_i(dataset, split, dataset_revision=dataset_revision)
     report = evaluate_gift_i(
         groups,
-        loaded.model,
+        model,
         protocol=protocol,
         reference=reference,
-        processor=loaded.processor,
-        size=loaded.size,
-        kind=kind or loaded.kind,
         prediction_scale=prediction_scale,
         batch_size=batch_size,
         progress=progress,
@@ -60,8 +57,8 @@ def run_evaluation(
         "dataset": str(dataset),
         "dataset_revision": dataset_revision,
         "split": split,
-        "size": list(loaded.size),
-        "kind": kind or loaded.kind,
+        "size": list(model.size),
+        "kind": model.kind,
     }
     write_report(report, out, color)
     return report
@@ -92,15 +89,14 @@ def run_booster(
         # What is wrong with these is said before large weights are loaded.
         get_protocol(options.get("protocol", "gift"))
         find_booster(root, options.get("subset"), options.get("official"))
-        loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
-        options |= {"processor": loaded.processor, "size": loaded.size, "kind": kind or loaded.kind}
-        report = evaluate_booster(root, loaded.model, **options)
+        model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
+        report = evaluate_booster(root, model, **options)
         report.about |= {
             "base": str(base),
             "revision": revision,
             "adapter": adapter and str(adapter),
             "adapter_scale": adapter_scale,
-            "size": list(loaded.size),
+            "size": list(model.size),
         }
     write_report(report, out, color)
     return report

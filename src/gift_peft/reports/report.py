@@ -19,7 +19,7 @@ from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markd
 from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table, protocol_note, uncertainty_table
 from gift_peft.files import write_whole
 from gift_peft.images import list_images
-from gift_peft.models.loading import load_model
+from gift_peft.models.loading import DepthModel
 from gift_peft.reports.ablation import ablation_table, is_ablation
 from gift_peft.reports.compare import write_compare
 from gift_peft.reports.curves import draw_dynamics, draw_retention
@@ -304,18 +304,22 @@ def _panels(
     """Panels group by group, the notable ones also into `kept`; only one group is in memory."""
     about = report.about
     base = about.get("base") or run.arguments.get("model_name_or_path")
-    loaded = load_model(
-        base, about["adapter"], about.get("adapter_scale"), about.get("revision"), about.get("size"), device
+    model = DepthModel.from_pretrained(
+        base,
+        about["adapter"],
+        about.get("adapter_scale"),
+        about.get("revision"),
+        about.get("size"),
+        about.get("kind"),
+        device,
     )
-    options = {"processor": loaded.processor, "size": loaded.size, "kind": about.get("kind") or loaded.kind}
-    options["protocol"] = report.protocol["name"]
     wanted = _wanted(report, notable)
     if not wanted:
         raise ValueError("no image has a known target to compare")
     groups = None if isinstance(report, BoosterReport) else _group_rows(report)
     for group_id, images in tqdm(wanted.items(), desc="pictures", unit="group", disable=None):
         labels = {image: _label(group_id, image, notable) for image in images}
-        for image, panel in zip(images, _group_panels(report, groups, group_id, labels, loaded, options), strict=True):
+        for image, panel in zip(images, _group_panels(report, groups, group_id, labels, model), strict=True):
             if (group_id, image) in notable:
                 kept[group_id, image] = panel
             yield panel
@@ -360,17 +364,17 @@ def _group_rows(report: AnyReport) -> Callable[[str], dict]:
     return find
 
 
-def _group_panels(report, find, group_id: str, labels: dict[str, str], loaded, options: dict) -> list[Panel]:
+def _group_panels(report, find, group_id: str, labels: dict[str, str], model: DepthModel) -> list[Panel]:
     from gift_peft.reports.panels import group_panels, scene_panels
 
     if isinstance(report, BoosterReport):
-        return scene_panels(report.about, group_id, labels, loaded.model, **options)
+        return scene_panels(report.about, group_id, labels, model, report.protocol["name"])
     row = find(group_id)
     missing = [image for image in labels if image not in row["image_names"]]
     if missing:
         raise ValueError(f"group {group_id} no longer has image {missing[0]}")
     numbers = {row["image_names"].index(image): label for image, label in labels.items()}
-    return group_panels(row, numbers, loaded.model, reference=report.reference, **options)
+    return group_panels(row, numbers, model, report.protocol["name"], report.reference)
 
 
 def _zero_shot(

@@ -13,6 +13,7 @@ from gift_peft.evaluation.on_booster import evaluate_booster
 from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.evaluation.results import REGIONS
 from gift_peft.losses import GeometryConsistencyError
+from gift_peft.models.loading import DepthModel
 from gift_peft.training.start import Interrupted
 
 if TYPE_CHECKING:
@@ -73,8 +74,7 @@ def _validate(run: Run, stop: SimpleNamespace) -> dict:
     alone = run.accelerator.num_processes == 1
     report = evaluate_gift_i(
         UntilStopped(run.validation_groups, stop) if alone else run.validation_groups,
-        run.model,
-        kind=run.kind,
+        _model(run),
         baseline=False,
         accelerator=run.accelerator,
         progress=False,
@@ -87,12 +87,13 @@ def _measure_booster(run: Run) -> dict:
     """RMSE in mm on Booster (protocol `gift`, a quarter of its size)."""
     report = evaluate_booster(
         run.args.booster_root,
-        run.model,
-        kind=run.kind,
-        processor=run.processor,
-        size=run.size,
+        _model(run),
         baseline=False,
         accelerator=run.accelerator,
         progress=False,
     )
     return {f"booster_{region}_rmse": report.summary[region]["rmse"] for region in ("tom", "other")}
+
+
+def _model(run: Run) -> DepthModel:
+    return DepthModel(run.model, run.processor, run.size, run.kind)

@@ -89,7 +89,7 @@ def test_wrong_usage_is_2(argv, run):
     ("argv", "message"),
     [
         (["train", "--lora_rnk=3"], "unknown argument --lora_rnk; did you mean lora_rank?"),
-        (["train", "--config", "nowhere.yaml"], "config: no such file: nowhere.yaml"),
+        (["train", "--config", "nowhere.yaml"], "config nowhere.yaml: no such file"),
         (["train", "--mixed_precision", "fp16", *train_arguments("b", "d", "o")], "mixed_precision: fp16"),
         (["train", *train_arguments("{base}", "{tmp}/none", "{tmp}/o")], "{tmp}/none"),
         (["proxies", "--base", "{base}", "--dataset", "{tmp}/none"], "{tmp}/none"),

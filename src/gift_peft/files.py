@@ -1,10 +1,16 @@
-"""Writing a file so that a reader finds the old one or the new one, whenever the writer is killed; and valid JSON."""
+"""Files and folders that are whole or absent, whenever their writer is killed; small files read with clear errors."""
 
 import math
 import os
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import yaml
+
+_OPENS_FOLDERS = os.name != "nt"  # Windows does not, so there only files are synced
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
@@ -35,6 +41,54 @@ def write_whole(path: Path, content: bytes | str) -> None:
             leftover.unlink(missing_ok=True)
 
 
+@contextmanager
+def whole_folder(target: Path) -> Iterator[Path]:
+    """A temporary folder beside `target`, which takes its name and place when the block ends without an error.
+
+    What was at `target` goes as a whole; after an error it is untouched and the temporary folder is deleted. Contents
+    reach the disk before the name does. A killed writer leaves `.<name>.tmp` or, for the blink of an eye, the old
+    folder as `.<name>.old`; the next one tidies up.
+    """
+    temporary, old = target.with_name(f".{target.name}.tmp"), target.with_name(f".{target.name}.old")
+    for folder in (temporary, old):
+        shutil.rmtree(folder, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    try:
+        yield temporary
+        for path in [*temporary.rglob("*"), temporary]:
+            _sync(path)
+        if target.exists():
+            os.replace(target, old)
+        os.replace(temporary, target)
+        _sync(target.parent)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def read_yaml(path: Path, name: str | None = None) -> dict:
+    """The mapping in a YAML file, {} for an empty one; `name` is how messages call the file, default its path.
+
+    Raises FileNotFoundError or ValueError, in one line.
+    """
+    name = name or str(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{name}: no such file")
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{name}: not valid YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(values or {}, dict):
+        raise ValueError(f"{name}: expected lines of the form `key: value`")
+    return values or {}
+
+
+def reason(error: BaseException) -> str:
+    """Why something failed, in one line of at most 200 characters: the first of the error's text, else its name."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
 def jsonable(value: Any) -> Any:
     """Nested JSON types; numbers that JSON cannot hold (NaN, infinity) become None."""
     if isinstance(value, Mapping):
@@ -46,3 +100,13 @@ def jsonable(value: Any) -> Any:
 
 def _escaped(name: str) -> str:
     return "".join(f"[{character}]" if character in "*?[" else character for character in name)
+
+
+def _sync(path: Path) -> None:
+    if path.is_dir() and not _OPENS_FOLDERS:
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
+from gift_peft.files import reason
+
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm"}
 SINGLE_CHANNEL = ("1", "L", "P", "I", "I;16", "I;16B", "I;16L")
 
@@ -42,7 +44,7 @@ def open_image(source: str | Path | bytes | Image.Image, name: str | None = None
     except FileNotFoundError:
         raise FileNotFoundError(f"{name}: no such file") from None
     except (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError) as error:
-        raise ValueError(f"{name}: not a readable image, or truncated ({str(error).splitlines()[0]})") from None
+        raise ValueError(f"{name}: not a readable image, or truncated ({reason(error)})") from None
     if deep and image.mode not in SINGLE_CHANNEL:
         raise ValueError(f"{name}: a 16-bit image; save it with 8 bits per channel")
     return image

@@ -76,7 +76,7 @@ def test_yaml_errors_name_file_and_key(tmp_path, text, message):
 def test_missing_config_file():
     with pytest.raises(ValueError, match="--config: expected one argument"):
         parse_arguments([*REQUIRED, "--config"])
-    with pytest.raises(FileNotFoundError, match=r"config: no such file: nowhere\.yaml"):
+    with pytest.raises(FileNotFoundError, match=r"config nowhere\.yaml: no such file"):
         parse_arguments(["--config", "nowhere.yaml", *REQUIRED])
 
 

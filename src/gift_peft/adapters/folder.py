@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-import shutil
 import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -19,7 +18,7 @@ from peft import LoraConfig, PeftConfig, PeftModel
 from peft.tuners.lora import LoraLayer
 
 from gift_peft.adapters.scale import active_lora, active_saved_modules
-from gift_peft.files import jsonable
+from gift_peft.files import jsonable, reason, whole_folder
 from gift_peft.rules import KINDS
 
 ADAPTER_CONFIG = "adapter_config.json"
@@ -62,10 +61,7 @@ def save_adapter(
     _check_replaceable(folder)
     base = base_model_name_or_path or _base_name(model)
     hub_base = _hub_name(base, card)
-    temporary = folder.with_name(f".{folder.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    try:
+    with whole_folder(folder) as temporary:
         model.save_pretrained(temporary, selected_adapters=["default"], save_embedding_layers=False)
         config = json.loads((temporary / ADAPTER_CONFIG).read_text())
         config.update(base_model_name_or_path=base, revision=revision)
@@ -76,9 +72,6 @@ def save_adapter(
         _write_json(temporary / GIFT, _gift_json(gift, size))
         # Last: PEFT writes a README of its own, which names a local base path.
         (temporary / "README.md").write_text(card or _minimal_card(hub_base), encoding="utf-8")
-        _replace_folder(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _full_scaling(layer: LoraLayer, name: str) -> float:
@@ -112,15 +105,6 @@ def _check_replaceable(folder: Path) -> None:
         raise ValueError(
             f"{folder} holds files that are no adapter's ({', '.join(others[:3])}): choose another folder"
         )
-
-
-def _replace_folder(new: Path, folder: Path) -> None:
-    old = folder.with_name(f".{folder.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    new.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def processor_at_size(processor: Any, size: tuple[int, int] | None) -> Any:
@@ -174,12 +158,11 @@ def read_adapter_config(adapter: str | Path) -> LoraConfig:
     try:
         config = PeftConfig.from_pretrained(adapter)
     except (KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise ValueError(f"{where} ({_first_line(error)})") from None
+        raise ValueError(f"{where} ({reason(error)})") from None
     except (OSError, ValueError) as error:
         if Path(adapter).is_dir():
-            raise ValueError(f"{where} ({_first_line(error)})") from None
-        reason = _first_line(error)
-        raise FileNotFoundError(f"adapter {adapter}: no such folder, and not on the hub ({reason})") from None
+            raise ValueError(f"{where} ({reason(error)})") from None
+        raise FileNotFoundError(f"adapter {adapter}: no such folder, and not on the hub ({reason(error)})") from None
     if not isinstance(config, LoraConfig):
         raise ValueError(f"adapter {adapter}: its peft_type is {config.peft_type}; GIFT adapters are LORA")
     _check_fields(config, where)
@@ -201,7 +184,7 @@ def _read_object(adapter: str | Path, name: str) -> dict[str, Any]:
     try:
         content = json.loads((Path(adapter) / name).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
-        raise ValueError(f"adapter {adapter}: damaged {name} ({_first_line(error)})") from None
+        raise ValueError(f"adapter {adapter}: damaged {name} ({reason(error)})") from None
     if not isinstance(content, dict):
         raise ValueError(f"adapter {adapter}: damaged {name} (it holds a {type(content).__name__}, not an object)")
     return content
@@ -241,7 +224,3 @@ def _check_fields(config: LoraConfig, where: str) -> None:
     for name, holds in checks.items():
         if not holds:
             raise ValueError(f"{where} ({name} cannot be {str(getattr(config, name))[:80]!r})")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

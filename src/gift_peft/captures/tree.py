@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import yaml
 from PIL import Image
 
 from gift_peft.captures.masks import MaskSource, find_mask, is_mask_file
+from gift_peft.files import read_yaml
 from gift_peft.images import image_digest, is_image_file, natural_key, read_image
 from gift_peft.rules import SPLITS, SURFACES, check_count, check_group
 
@@ -260,11 +260,8 @@ def _facts(folder: Path) -> dict:
     path = folder / "group.yaml"
     if not path.exists():
         return {}
-    try:
-        facts = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
-    if not isinstance(facts, dict) or not facts.keys() <= GROUP_KEYS:
+    facts = read_yaml(path)
+    if not facts.keys() <= GROUP_KEYS:
         raise ValueError(f"{path}: it may have the keys {', '.join(sorted(GROUP_KEYS))} and no others")
     if facts.get("surface") not in (None, *SURFACES):
         raise ValueError(f"{path}: surface {facts['surface']!r}; it is one of {', '.join(SURFACES)}")

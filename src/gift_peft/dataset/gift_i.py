@@ -28,6 +28,7 @@ from tqdm import tqdm
 from gift_peft.captures.tree import list_groups, raw_example
 from gift_peft.dataset.proxies import FORMAT, ProxyStore, default_proxies_dir
 from gift_peft.dataset.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
+from gift_peft.files import reason
 from gift_peft.images import image_digest, natural_key, to_mask
 from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
@@ -238,8 +239,7 @@ def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.D
 
 
 def _unreadable(path: str | Path, error: BaseException) -> ValueError:
-    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-    return ValueError(f"dataset {path}: its metadata cannot be read ({reason})")
+    return ValueError(f"dataset {path}: its metadata cannot be read ({reason(error)})")
 
 
 def _load_from_hub(repository: str, split: str, revision: str | None) -> datasets.Dataset:
@@ -248,8 +248,8 @@ def _load_from_hub(repository: str, split: str, revision: str | None) -> dataset
     try:
         return datasets.load_dataset(repository, split=split, features=FEATURES, revision=revision)
     except (FileNotFoundError, ConnectionError) as error:
-        reason = str(error).splitlines()[0]
-        raise FileNotFoundError(f"dataset {repository}: no such folder, nor on the hub ({reason})") from None
+        why = reason(error)
+        raise FileNotFoundError(f"dataset {repository}: no such folder, nor on the hub ({why})") from None
 
 
 def _check_split(split: str, present, path) -> None:

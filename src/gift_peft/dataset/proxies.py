@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import safetensors
 
-from gift_peft.files import write_whole
+from gift_peft.files import reason, write_whole
 from gift_peft.images import image_digest
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def read_header(path: Path, command: str = "gift-peft proxies") -> dict:
             return json.loads((file.metadata() or {}).get(METADATA, "{}"))
     except (safetensors.SafetensorError, json.JSONDecodeError) as error:
         raise ValueError(
-            f"damaged proxy {path} ({str(error).splitlines()[0]}); make it again with `{command} --overwrite`"
+            f"damaged proxy {path} ({reason(error)}); make it again with `{command} --overwrite`"
         ) from None
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gift_peft.files import reason
 from gift_peft.images import SINGLE_CHANNEL, is_image_file, natural_key, open_image, to_mask
 
 SUBSETS = ("balanced", "unbalanced")
@@ -243,7 +244,7 @@ def _read_disparity(path: Path) -> np.ndarray:
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
     except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"{path}: not a readable npy file ({str(error).splitlines()[0]})") from None
+        raise ValueError(f"{path}: not a readable npy file ({reason(error)})") from None
     if not isinstance(disparity, np.ndarray) or disparity.ndim != 2 or disparity.dtype.kind not in "fiu":
         found = f"{disparity.dtype} {disparity.shape}" if isinstance(disparity, np.ndarray) else "an archive"
         raise ValueError(f"{path}: {found}; disparity is (H,W) numbers")

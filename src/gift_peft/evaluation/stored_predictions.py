@@ -12,6 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from gift_peft.evaluation.booster_scenes import CAMERA, BoosterScene
+from gift_peft.files import reason
 from gift_peft.images import open_image
 
 SUFFIXES = (".npy", ".npz", ".pfm", ".png")
@@ -91,7 +92,7 @@ def _read_array(path: Path) -> np.ndarray:
                 raise ValueError(f"{len(archive.files)} arrays ({', '.join(archive.files)}) where one is expected")
             return archive[archive.files[0]]
     except (ValueError, OSError, EOFError, BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path}: not a readable prediction ({str(error).splitlines()[0]})") from None
+        raise ValueError(f"{path}: not a readable prediction ({reason(error)})") from None
 
 
 def _read_picture(path: Path) -> np.ndarray:

@@ -5,7 +5,6 @@ The folder has config, safetensors, image processor and the model's own code, so
 """
 
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from huggingface_hub.errors import StrictDataclassError
 from safetensors import SafetensorError
 from transformers import PreTrainedConfig, PreTrainedModel
 
+from gift_peft.files import whole_folder
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
 from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil
 
@@ -90,18 +90,11 @@ def _convert(
     if config is not None and not isinstance(config, PreTrainedConfig):
         config = _read_config(model_class.config_class, config)
     model = model_class.from_official(source, config)
-    temporary = folder.with_name(f".{folder.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
     try:
-        model.save_pretrained(temporary)
-        processor.save_pretrained(temporary)
-        _check_free(folder)
-        if folder.exists():
-            folder.rmdir()
-        temporary.rename(folder)
+        with whole_folder(folder) as temporary:
+            model.save_pretrained(temporary)
+            processor.save_pretrained(temporary)
+            _check_free(folder)  # again: conversion takes minutes
     except SafetensorError as error:  # a full disk, which is no OSError there
         raise OSError(f"{folder}: the weights cannot be written ({error})") from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return folder

@@ -14,6 +14,8 @@ from torch import nn
 from transformers import DPTImageProcessorPil
 from transformers.modeling_outputs import DepthEstimatorOutput
 
+from gift_peft.files import reason
+
 SIZE = (476, 644)  # of the paper's backbones; a multiple of the patches of both
 PATCH = 14
 IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
@@ -65,13 +67,9 @@ def load_external(base: Any) -> tuple[ExternalDepth, DPTImageProcessorPil]:
     except ImportError as error:
         raise ValueError(f"base {base}: {error}; {_INSTALL[package]}") from None
     except OSError as error:
-        raise FileNotFoundError(f"base {base}: {_reason(error)}") from None
+        raise FileNotFoundError(f"base {base}: {reason(error)}") from None
     except (RuntimeError, KeyError, TypeError) as error:  # weights of something else
-        raise ValueError(f"base {base}: {_reason(error)}") from None
-
-
-def _reason(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)[:200]
+        raise ValueError(f"base {base}: {reason(error)}") from None
 
 
 # ---- Depth Anything 3 ----

@@ -5,6 +5,8 @@ import hashlib
 import re
 from pathlib import Path
 
+from gift_peft.files import reason
+
 
 def teacher_id(base: str | Path, revision: str | None = None) -> str:
     """The teacher's folder under `proxies/`: `owner--name[@revision]` for a hub id, the folder's name for a path."""
@@ -47,7 +49,7 @@ def teacher_revision(base: str | Path, revision: str | None = None) -> str:
     try:
         config = cached_file(str(base), "config.json", revision=revision)
     except OSError as error:
-        raise FileNotFoundError(f"base model {base}: {str(error).splitlines()[0]}") from None
+        raise FileNotFoundError(f"base model {base}: {reason(error)}") from None
     return extract_commit_hash(config, None) or "unknown"
 
 

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from gift_peft.files import reason
 from gift_peft.images import read_image
 from gift_peft.models.identity import check_base_name, teacher_revision
 from gift_peft.models.pixels import resolve_size, to_pixel_values
@@ -288,13 +289,13 @@ def load_base(base: str | Path, revision: str | None = None) -> tuple[Any, Any]:
         model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, **options)
         return model.eval(), load_processor(base, revision)
     except OSError as error:
-        raise FileNotFoundError(f"base model {base}: {_first_line(error)}") from error
+        raise FileNotFoundError(f"base model {base}: {reason(error)}") from error
     except pickle.UnpicklingError:
         raise ValueError(
             f"base model {base}: its weights are a pickle that would run code; take safetensors"
         ) from None
     except (ValueError, RuntimeError, SafetensorError) as error:  # of another shape, cut off, no tensors
-        raise ValueError(f"base model {base}: {_first_line(error)}") from error
+        raise ValueError(f"base model {base}: {reason(error)}") from error
 
 
 def load_processor(source: str | Path, revision: str | None = None) -> Any:
@@ -321,14 +322,14 @@ def _attach(model, processor, base, adapter, revision):
         try:
             model = PeftModel.from_pretrained(model, adapter)
         except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, UserWarning, re.error) as error:
-            raise ValueError(f"{mismatch} ({_first_line(error)})") from None
+            raise ValueError(f"{mismatch} ({reason(error)})") from None
         except (OSError, SafetensorError) as error:
-            raise ValueError(f"adapter {adapter}: damaged {ADAPTER_WEIGHTS} ({_first_line(error)})") from None
+            raise ValueError(f"adapter {adapter}: damaged {ADAPTER_WEIGHTS} ({reason(error)})") from None
     try:
         processor = load_processor(adapter)
     except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
         if (Path(adapter) / PROCESSOR_CONFIG).exists():
-            raise ValueError(f"adapter {adapter}: damaged {PROCESSOR_CONFIG} ({_first_line(error)})") from None
+            raise ValueError(f"adapter {adapter}: damaged {PROCESSOR_CONFIG} ({reason(error)})") from None
         # An adapter that PEFT alone saved: the base's processor serves.
     return model, processor
 
@@ -349,7 +350,3 @@ def _check_base(base, revision, adapter, made_for: str | None) -> None:
         raise ValueError(f"adapter {adapter} was trained on {made_for}, whose files are not those of base {base}")
     if made_for not in (None, str(base)) and not was_folder and not is_folder and not Path(made_for).exists():
         raise ValueError(f"adapter {adapter} was trained on {made_for}, not on base {base}")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

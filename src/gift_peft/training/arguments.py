@@ -14,6 +14,7 @@ from typing import Literal, get_origin
 
 import yaml
 
+from gift_peft.files import read_yaml
 from gift_peft.models.pixels import parse_size
 
 # What a run may be resumed with when it differs: everything else changes the weights that come out.
@@ -235,14 +236,7 @@ def _raise(message: str):
 
 def _yaml_to_argv(path: Path) -> list[str]:
     """The file's keys as if they stood on the command line, so that both are checked by the same parser."""
-    if not path.is_file():
-        raise FileNotFoundError(f"config: no such file: {path}")
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"config {path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(values, dict):
-        raise ValueError(f"config {path}: expected lines of the form `key: value`")
+    values = read_yaml(path, f"config {path}")
     argv = []
     types = {f.name: f.type for f in fields(GiftTrainingArguments)}
     for key, value in values.items():

@@ -19,7 +19,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from gift_peft.files import write_whole
+from gift_peft.files import whole_folder, write_whole
 
 BEST = "best"
 CHECKSUMS = "checksums.json"
@@ -47,7 +47,7 @@ def write_checkpoint(
     `save(folder)` writes the adapter, `state` is JSON, `best` the best adapter's folder. OSError if writing fails.
     """
     target = output_dir / f"checkpoint-{step}"
-    with disk_errors(target), new_folder(target) as folder:
+    with disk_errors(target), whole_folder(target) as folder:
         save(folder)
         save_file(optimizer_tensors(model, optimizer), folder / OPTIMIZER)
         save_file(_rng_tensors(), folder / RNG)
@@ -152,27 +152,6 @@ def prune_checkpoints(output_dir: Path, step: int, limit: int | None, keep: list
 
 
 @contextmanager
-def new_folder(target: Path):
-    """A temporary folder beside `target` that takes its name when the block ends well, and vanishes otherwise."""
-    temporary, old = target.with_name(f".{target.name}.tmp"), target.with_name(f".{target.name}.old")
-    for folder in (temporary, old):
-        shutil.rmtree(folder, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    try:
-        yield temporary
-        for path in [*_files(temporary), *(p for p in temporary.rglob("*") if p.is_dir()), temporary]:
-            _sync(path)
-        if target.exists():
-            os.replace(target, old)
-        os.replace(temporary, target)
-        _sync(target.parent)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
-
-
-@contextmanager
 def disk_errors(target: Path):
     """OSError naming `target` for what goes wrong on the disk; safetensors has an exception of its own for that."""
     try:
@@ -253,14 +232,6 @@ def _link_weights(source: str, target: str) -> None:
 def _digest(path: Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @dataclass

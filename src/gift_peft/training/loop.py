@@ -26,7 +26,7 @@ from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.booster_scenes import find_booster
 from gift_peft.evaluation.table_formats import number
 from gift_peft.evaluation.tables import relative_change
-from gift_peft.files import jsonable
+from gift_peft.files import jsonable, whole_folder
 from gift_peft.group_step import GroupStep
 from gift_peft.models.identity import teacher_revision
 from gift_peft.models.loading import load_base
@@ -327,7 +327,7 @@ class Run:
             write_metrics(self.output, state.rows)
             best = self.output / "adapter"
             if state.best_step:
-                with checkpoints.new_folder(best) as folder:
+                with whole_folder(best) as folder:
                     shutil.copytree(checkpoint / checkpoints.BEST, folder, dirs_exist_ok=True)
             else:
                 shutil.rmtree(best, ignore_errors=True)

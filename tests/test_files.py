@@ -1,0 +1,94 @@
+"""Whole or absent: files and folders; and small files whose faults are told in one line."""
+
+import math
+import os
+
+import pytest
+
+from gift_peft.files import jsonable, read_yaml, reason, whole_folder, write_whole
+
+
+def test_a_folder_is_whole_or_absent(tmp_path):
+    target = tmp_path / "target"
+    with whole_folder(target) as folder:
+        assert not target.exists()
+        (folder / "inner").mkdir()
+        (folder / "inner/a").write_text("old")
+    with pytest.raises(OSError, match="full"), whole_folder(target) as folder:
+        (folder / "a").write_text("new")
+        raise OSError("disk full")
+    assert [path.name for path in tmp_path.iterdir()] == ["target"]
+    assert (target / "inner/a").read_text() == "old"
+
+
+def test_a_folder_replaces_the_earlier_one_and_what_a_killed_writer_left(tmp_path):
+    target = tmp_path / "target"
+    for name in ("target", ".target.tmp", ".target.old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "stale").write_text(name)
+    with whole_folder(target) as folder:
+        (folder / "fresh").write_text("")
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["target", "target/fresh"]
+
+
+def test_a_file_stands_in_the_way_of_a_folder(tmp_path):
+    (tmp_path / "target").write_text("mine")
+    with pytest.raises(OSError), whole_folder(tmp_path / "target/inner"):
+        pass
+    assert (tmp_path / "target").read_text() == "mine"
+
+
+def test_windows_opens_no_folders_to_sync(tmp_path, monkeypatch):
+    """os.open of a folder is PermissionError there; files are still synced."""
+    synced, real = [], os.open
+
+    def opens(path, flags, *rest):
+        if os.path.isdir(path):
+            raise PermissionError(13, "Permission denied", str(path))
+        synced.append(os.path.basename(path))
+        return real(path, flags, *rest)
+
+    target = tmp_path / "target"
+    monkeypatch.setattr("gift_peft.files._OPENS_FOLDERS", False)
+    monkeypatch.setattr(os, "open", opens)
+    with whole_folder(target) as folder:
+        (folder / "inner").mkdir()
+        (folder / "inner/a").write_text("x")
+    assert (target / "inner/a").read_text() == "x" and "a" in synced
+
+
+def test_an_error_without_a_text_has_a_reason():
+    assert reason(EOFError()) == "EOFError"
+    assert reason(ValueError("  ")) == "ValueError"
+    assert reason(ValueError("\nfirst\nsecond")) == "first"
+    assert len(reason(ValueError("x" * 1000))) == 200
+
+
+def test_yaml_is_read_or_refused_in_one_line(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("a: 1\n")
+    assert read_yaml(path) == {"a": 1}
+    path.write_text("# nothing\n")
+    assert read_yaml(path) == {}
+    for content, message in (
+        (b"- 1\n", "expected lines of the form `key: value`"),
+        (b"text\n", "expected lines"),
+        (b"a: b: c\n", "not valid YAML"),
+        (b"a: \xff\n", "not valid YAML"),
+        (b"[" * 5000, "not valid YAML"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=message) as caught:
+            read_yaml(path, "config a.yaml")
+        assert str(caught.value).startswith("config a.yaml: ") and "\n" not in str(caught.value)
+    with pytest.raises(FileNotFoundError, match=r"b\.yaml: no such file"):
+        read_yaml(tmp_path / "b.yaml")
+
+
+def test_json_holds_no_nan():
+    assert jsonable({"a": [math.nan, 1.0, (math.inf,)], "b": None}) == {"a": [None, 1.0, [None]], "b": None}
+
+
+def test_text_is_written_as_utf8(tmp_path):
+    write_whole(tmp_path / "a/b.txt", "größe")
+    assert (tmp_path / "a/b.txt").read_bytes() == "größe".encode()

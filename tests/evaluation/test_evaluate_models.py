@@ -10,8 +10,8 @@ from helpers.tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw
 
 from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
-from gift_peft.evaluation.results import GiftIReport
+from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.verb import run_evaluation
 from gift_peft.training.teacher import make_proxies
 
@@ -118,7 +118,7 @@ def shake_alone():
 def test_two_processes_give_the_report_of_one(tmp_path):
     raw = write_raw_tree(tmp_path / "raw", validation=(2, 3, 2))
     debug_launcher(_evaluate_in_two_processes, (raw, tmp_path), num_processes=2)
-    one, two = (GiftIReport.load(tmp_path / rank) for rank in "01")
+    one, two = (Report.load(tmp_path / rank) for rank in "01")
     assert one.to_dict() == two.to_dict() and one.rows == two.rows
     assert [row["group_id"] for row in one.rows] == [f"scene_{100 + g}" for g in (0, 0, 1, 1, 1, 2, 2)]
     alone = evaluate_gift_i(raw, shake_alone(), processor=tiny_processor(), size=SIZE, progress=False)

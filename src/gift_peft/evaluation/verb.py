@@ -5,13 +5,9 @@ from typing import Any
 
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.evaluation.booster_scenes import find_booster
-from gift_peft.evaluation.on_booster import evaluate_booster
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
+from gift_peft.evaluation.evaluate import evaluate_booster, evaluate_gift_i
 from gift_peft.evaluation.protocols import get_protocol
-from gift_peft.evaluation.results import (
-    BoosterReport,
-    GiftIReport,
-)
+from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.files import write_whole
 from gift_peft.models.loading import DepthModel
@@ -36,7 +32,7 @@ def run_evaluation(
     device: str | None = None,
     color: bool = False,
     progress: bool = True,
-) -> GiftIReport:
+) -> Report:
     """`gift-peft evaluate`: loads, evaluates, prints the table, writes `metrics.json`, `rows.jsonl`, `report.md`."""
     model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
     groups = load_gift_i(dataset, split, dataset_revision=dataset_revision)
@@ -78,7 +74,7 @@ def run_booster(
     device: str | None = None,
     color: bool = False,
     **options: Any,
-) -> BoosterReport:
+) -> Report:
     """`gift-peft evaluate --booster`: as `run_evaluation`, of a base or of stored predictions.
 
     `options` are those of `evaluate_booster`.
@@ -102,7 +98,7 @@ def run_booster(
     return report
 
 
-def write_report(report: GiftIReport | BoosterReport, out: str | Path, color: bool = False) -> None:
+def write_report(report: Report, out: str | Path, color: bool = False) -> None:
     """Leaves the report in a folder and prints its table."""
     folder = report.save(out)
     write_whole(folder / "report.md", markdown_table(report))

@@ -10,8 +10,8 @@ from typing import Any
 import yaml
 
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.results import REGIONS, BoosterReport
-from gift_peft.evaluation.tables import REGION_NAMES, AnyReport
+from gift_peft.evaluation.results import REGIONS, Report
+from gift_peft.evaluation.tables import REGION_NAMES
 from gift_peft.reports.backbones import BASES, Base
 
 # As the models' pages state them: of Depth Anything V2 only the small one may be used commercially.
@@ -48,7 +48,7 @@ def base_license(base: str) -> str:
     return LICENSES.get(base, "other")
 
 
-def card_metadata(arguments: Mapping, record: Mapping | None, reports: Sequence[AnyReport], base: Base | None) -> Any:
+def card_metadata(arguments: Mapping, record: Mapping | None, reports: Sequence[Report], base: Base | None) -> Any:
     """`ModelCardData` of an adapter; arguments as in `model_card`, `base` if it is one of the paper's backbones."""
     from huggingface_hub import ModelCardData
 
@@ -70,13 +70,13 @@ def card_metadata(arguments: Mapping, record: Mapping | None, reports: Sequence[
     )
 
 
-def _eval_results(arguments: Mapping, record: Mapping | None, reports: Sequence[AnyReport]) -> list:
+def _eval_results(arguments: Mapping, record: Mapping | None, reports: Sequence[Report]) -> list:
     """One entry per metric of the adapter: of every report, else of the run's own validation."""
     entries = []
     dataset = arguments.get("dataset_name") or "gift-i"
     kind = "gift-i" if is_local(dataset) else dataset
     for report in reports:
-        if isinstance(report, BoosterReport):
+        if report.dataset == "booster":
             config = f"{report.about.get('subset') or 'default'}, protocol {report.protocol['name']}"
             entries.append(("Booster", "booster", config, _flat(report.summary)))
             continue

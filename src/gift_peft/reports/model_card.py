@@ -11,13 +11,12 @@ from typing import Any
 import yaml
 
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.results import REGIONS, BoosterReport
+from gift_peft.evaluation.results import REGIONS, Report
 from gift_peft.evaluation.table_formats import number, to_markdown
 from gift_peft.evaluation.tables import (
     METRIC_NAMES,
     NO_TEACHING,
     REGION_NAMES,
-    AnyReport,
     consensus_teaches,
     markdown_table,
     relative_change,
@@ -34,7 +33,7 @@ KINDS = {
 
 
 def model_card(
-    arguments: Mapping[str, Any], record: Mapping[str, Any] | None = None, reports: Sequence[AnyReport] = ()
+    arguments: Mapping[str, Any], record: Mapping[str, Any] | None = None, reports: Sequence[Report] = ()
 ) -> str:
     """README.md of an adapter.
 
@@ -130,7 +129,7 @@ model = PeftModel.from_pretrained(base, "{repository}")
 5.18 or newer (module names changed there)."""
 
 
-def _results(record: Mapping | None, reports: Sequence[AnyReport]) -> str:
+def _results(record: Mapping | None, reports: Sequence[Report]) -> str:
     if reports:
         parts = []
         for report in reports:
@@ -156,12 +155,12 @@ def _results(record: Mapping | None, reports: Sequence[AnyReport]) -> str:
     return "\n".join([_fill(head), "", "| | base | adapted | change |", "|---|---:|---:|---:|", *lines])
 
 
-def _retention(record: Mapping | None, reports: Sequence[AnyReport]) -> str:
+def _retention(record: Mapping | None, reports: Sequence[Report]) -> str:
     """What the adapter costs outside the target."""
     lines = []
     for report in reports:
         if report.base and report.adapted:
-            where = "Booster" if isinstance(report, BoosterReport) else f"GIFT-I, {report.reference}"
+            where = "Booster" if report.dataset == "booster" else f"GIFT-I, {report.reference}"
             lines.append((where, report.base["other"], report.summary["other"]))
     if not lines and record is not None:
         base, adapted = ({m: record["metrics"][k].get(f"val_other_{m}") for m in METRICS} for k in ("base", "adapter"))
@@ -283,13 +282,13 @@ def _run_lines(record: Mapping) -> str:
     return "\n".join(lines)
 
 
-def _limits(record: Mapping | None, reports: Sequence[AnyReport]) -> str:
+def _limits(record: Mapping | None, reports: Sequence[Report]) -> str:
     limits = []
     for report in reports:
-        where = "Booster" if isinstance(report, BoosterReport) else f"GIFT-I ({report.reference})"
+        where = "Booster" if report.dataset == "booster" else f"GIFT-I ({report.reference})"
         if report.collapse and report.collapse["alarm"]:
             limits.append(f"Collapse alarm on {where}: the outputs shrank, grew or flattened. Do not use it.")
-        if not isinstance(report, BoosterReport) and consensus_teaches(report) is False:
+        if consensus_teaches(report) is False:
             limits.append(f"{where}: {NO_TEACHING}")
         if report.base and report.adapted:
             for region in ("tom", "other"):

@@ -1,53 +1,38 @@
 """From models and data to the panels of a figure: each group or scene is predicted once for all its panels."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
-import numpy as np
-import torch
+from PIL import Image
 
-from gift_peft.dataset.tensors import collate_group
+from gift_peft.evaluation.alignment import resize_prediction
 from gift_peft.evaluation.booster_scenes import find_booster, read_ground_truth
-from gift_peft.evaluation.on_gift_i import REFERENCES
-from gift_peft.evaluation.protocols import Protocol, get_protocol
-from gift_peft.evaluation.scoring import Task, references, resize_prediction
+from gift_peft.evaluation.evaluate import REFERENCES
+from gift_peft.evaluation.protocols import get_protocol
+from gift_peft.evaluation.samples import Sample, booster_sample, gift_i_sample, predict_scene
 from gift_peft.images import read_image
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.figures import Panel
 
 
 def group_panels(
-    row: dict,
-    labels: Mapping[int, str],
-    model: DepthModel,
-    protocol: str | None = None,
-    reference: str = "depth",
+    row: dict, labels: Mapping[str, str], model: DepthModel, protocol: str | None = None, reference: str = "depth"
 ) -> list[Panel]:
     """Observations of a group of GIFT-I as rows of `before_after`.
 
     Args:
         row: of `load_gift_i`.
-        labels: {index of the observation: what stands above it}.
+        labels: {name of the image: what stands above it}.
         model: with an adapter or a teacher.
         protocol, reference: as in `evaluate_gift_i`.
 
     Raises:
-        ValueError: the group has no such reference.
+        ValueError: the group has no such image, or no such reference.
     """
-    rules = get_protocol(protocol or REFERENCES[reference])
-    kind = model.known_kind()
-    task = Task({}, model, [], rules, reference, kind)
-    group = collate_group(row, model.processor, model.size)
-    targets, masks, valids = references(row, group, task)
-    maps = [predict(group.pixel_values) for predict in (model.predict_base, model.predict)]
-    panels = []
-    for index, label in labels.items():
-        if targets[index] is None:
-            raise ValueError(f"group {group.group_id} has no {reference} to compare with")
-        base, adapted = (_on_grid(depth[index], targets[index].shape, model, rules) for depth in maps)
-        panel = Panel(label, row["images"][index], targets[index], base, adapted, masks[index], kind, rules.name)
-        panel.valid = valids[index]
-        panels.append(panel)
-    return panels
+    pictures = dict(zip(row["image_names"], row["images"], strict=True))
+    _check(f"group {row['group_id']}", labels, pictures)
+    sample = gift_i_sample(row, model, {"base": model.predict_base, "adapted": model.predict}, reference)
+    return _panels(sample, labels, pictures, model, protocol or REFERENCES[reference])
 
 
 def scene_panels(
@@ -65,26 +50,39 @@ def scene_panels(
     Raises:
         FileNotFoundError: the data is not where it was. ValueError: no such scene or image.
     """
-    rules, kind = get_protocol(protocol), model.known_kind()
     scenes = {scene.name: scene for scene in find_booster(about["root"], about["subset"], official=False).scenes}
     if scene_name not in scenes:
         raise ValueError(f"Booster root {about['root']} has no scene {scene_name}")
-    truth = read_ground_truth(scenes[scene_name], about["resize"], about["occlusion"], about["tom_classes"])
-    files = {path.stem: path for path in scenes[scene_name].images}
-    if missing := labels.keys() - files.keys():
-        raise ValueError(f"scene {scene_name} has no image {min(missing)}")
-    images = {stem: read_image(files[stem]) for stem in labels}
-    pixel_values = torch.cat([model.inputs([image]) for image in images.values()])
-    maps = [predict(pixel_values) for predict in (model.predict_base, model.predict)]
+    scene = scenes[scene_name]
+    truth = read_ground_truth(scene, about["resize"], about["occlusion"], about["tom_classes"])
+    files = {path.stem: path for path in scene.images}
+    _check(f"scene {scene_name}", labels, files)
+    scene = replace(scene, images=tuple(files[stem] for stem in labels))
+    pictures = {stem: read_image(files[stem]).resize(truth.depth.shape[::-1]) for stem in labels}
+    predictions = predict_scene(scene, truth, model, {"base": model.predict_base, "adapted": model.predict})
+    return _panels(booster_sample(scene, truth, predictions), labels, pictures, model, protocol)
+
+
+def _check(where: str, labels: Mapping[str, str], pictures: Mapping) -> None:
+    if missing := labels.keys() - pictures.keys():
+        raise ValueError(f"{where} has no image {min(missing)}")
+
+
+def _panels(
+    sample: Sample, labels: Mapping[str, str], pictures: Mapping[str, Image.Image], model: DepthModel, protocol: str
+) -> list[Panel]:
+    """In the order of the labels; predictions in mm where the protocol fits no scale."""
+    scale = 1.0 if get_protocol(protocol).fits_scale else model.millimeters_per_unit
+    found = {observation.name: observation for observation in sample.observations}
     panels = []
-    for (stem, label), *depths in zip(labels.items(), *maps, strict=True):
-        base, adapted = (_on_grid(depth, truth.depth.shape, model, rules) for depth in depths)
-        small = images[stem].resize(truth.depth.shape[::-1])
-        panels.append(Panel(label, small, truth.depth, base, adapted, truth.tom, kind, protocol))
+    for name, label in labels.items():
+        one = found[name]
+        if one.reference is None:
+            raise ValueError(f"group {sample.group_id} has no reference to compare {name} with")
+        base, adapted = (
+            scale * resize_prediction(one.predictions[m], one.reference.shape) for m in ("base", "adapted")
+        )
+        panel = Panel(label, pictures[name], one.reference, base, adapted, one.mask, model.known_kind(), protocol)
+        panel.valid = one.valid
+        panels.append(panel)
     return panels
-
-
-def _on_grid(depth: torch.Tensor, shape: tuple[int, int], model: DepthModel, rules: Protocol) -> np.ndarray:
-    """A prediction at the reference's size, in mm where the protocol fits no scale."""
-    scale = model.millimeters_per_unit if rules.dof in ("none", "shift") else 1.0
-    return scale * resize_prediction(depth, shape)

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from gift_peft.evaluation.results import BoosterReport
+from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
-from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table, protocol_note, uncertainty_table
+from gift_peft.evaluation.tables import comparison_table, group_table, protocol_note, uncertainty_table
 from gift_peft.files import write_whole
 from gift_peft.images import list_images
 from gift_peft.models.loading import DepthModel
@@ -142,7 +142,7 @@ def _write_card(run: SavedRun, path: Path) -> Path:
     return path
 
 
-def _is_of_adapter(run: SavedRun, report: AnyReport) -> bool:
+def _is_of_adapter(run: SavedRun, report: Report) -> bool:
     """Whether an evaluation is of the run's adapter as it is: not scaled, and not of one with other weights."""
     if not report.adapted or report.about.get("adapter_scale") not in (None, 1):
         return False
@@ -178,7 +178,7 @@ def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> N
 
 def _tables(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> None:
     """One comparison per dataset and protocol, with intervals and groups of every report behind it."""
-    together: dict[tuple, list[tuple[str, str, AnyReport]]] = {}
+    together: dict[tuple, list[tuple[str, str, Report]]] = {}
     for run, name, own in zip(runs, names, folder_names(runs), strict=True):
         for report in run.evaluations.values():
             key = (_dataset(report), report.unit, protocol_note(report))
@@ -208,11 +208,11 @@ HEADINGS = {
 }
 
 
-def _dataset(report: AnyReport) -> str:
-    return "booster" if isinstance(report, BoosterReport) else f"gift-i-{report.reference}"
+def _dataset(report: Report) -> str:
+    return "booster" if report.dataset == "booster" else f"gift-i-{report.reference}"
 
 
-def _scaled(name: str, report: AnyReport) -> str:
+def _scaled(name: str, report: Report) -> str:
     scale = report.about.get("adapter_scale")
     return name if scale in (None, 1) else f"{name} (adapter scale {scale:g})"
 
@@ -270,7 +270,7 @@ def _pictures(run: SavedRun, name: str, output: Output, count: int, device: str 
         output.figure(f"errors{stem}", f"{title}: errors", partial(error_maps, rows))
 
 
-def notable_observations(report: AnyReport, count: int) -> dict[tuple[str, str], str]:
+def notable_observations(report: Report, count: int) -> dict[tuple[str, str], str]:
     """{(group, image): why}: in turn where the base errs most in the target, where it got better, and where worse.
 
     Each of another group, chosen by these rules alone, so that nobody has to trust a choice of pictures.
@@ -299,7 +299,7 @@ def notable_observations(report: AnyReport, count: int) -> dict[tuple[str, str],
 
 
 def _panels(
-    run: SavedRun, report: AnyReport, notable: dict, kept: dict[tuple[str, str], Panel], device: str | None
+    run: SavedRun, report: Report, notable: dict, kept: dict[tuple[str, str], Panel], device: str | None
 ) -> Iterator[Panel]:
     """Panels group by group, the notable ones also into `kept`; only one group is in memory."""
     about = report.about
@@ -316,7 +316,7 @@ def _panels(
     wanted = _wanted(report, notable)
     if not wanted:
         raise ValueError("no image has a known target to compare")
-    groups = None if isinstance(report, BoosterReport) else _group_rows(report)
+    groups = None if report.dataset == "booster" else _group_rows(report)
     for group_id, images in tqdm(wanted.items(), desc="pictures", unit="group", disable=None):
         labels = {image: _label(group_id, image, notable) for image in images}
         for image, panel in zip(images, _group_panels(report, groups, group_id, labels, model), strict=True):
@@ -325,7 +325,7 @@ def _panels(
             yield panel
 
 
-def _wanted(report: AnyReport, notable: dict) -> dict[str, list[str]]:
+def _wanted(report: Report, notable: dict) -> dict[str, list[str]]:
     """{group: images}: of each group the image on which the base errs most, and the notable ones; largest errors."""
     worst: dict[str, tuple[float, str]] = {}
     for row in report.rows:
@@ -346,7 +346,7 @@ def _label(group_id: str, image: str, notable: dict) -> str:
     return f"{group_id}/{image}" + (f", {reason}" if reason else "")
 
 
-def _group_rows(report: AnyReport) -> Callable[[str], dict]:
+def _group_rows(report: Report) -> Callable[[str], dict]:
     """From a group's id to its row of the dataset."""
     from gift_peft.dataset.gift_i import load_gift_i
 
@@ -367,14 +367,9 @@ def _group_rows(report: AnyReport) -> Callable[[str], dict]:
 def _group_panels(report, find, group_id: str, labels: dict[str, str], model: DepthModel) -> list[Panel]:
     from gift_peft.reports.panels import group_panels, scene_panels
 
-    if isinstance(report, BoosterReport):
+    if report.dataset == "booster":
         return scene_panels(report.about, group_id, labels, model, report.protocol["name"])
-    row = find(group_id)
-    missing = [image for image in labels if image not in row["image_names"]]
-    if missing:
-        raise ValueError(f"group {group_id} no longer has image {missing[0]}")
-    numbers = {row["image_names"].index(image): label for image, label in labels.items()}
-    return group_panels(row, numbers, model, report.protocol["name"], report.reference)
+    return group_panels(find(group_id), labels, model, report.protocol["name"], report.reference)
 
 
 def _zero_shot(

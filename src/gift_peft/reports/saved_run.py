@@ -7,8 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from gift_peft.evaluation.results import load_report
-from gift_peft.evaluation.tables import AnyReport
+from gift_peft.evaluation.results import Report
 from gift_peft.reports.card_metadata import portable_name
 
 
@@ -21,14 +20,14 @@ class SavedRun:
         arguments (`dict`): config.yaml; empty for an evaluation alone.
         history (`list[dict]`): the rows of metrics.jsonl; empty before the base was measured.
         record (`dict`, *optional*): adapter/gift.json; None before an adapter was written.
-        evaluations (`dict[str, GiftIReport | BoosterReport]`): saved ones, by the name of their folder.
+        evaluations (`dict[str, Report]`): saved ones, by the name of their folder.
     """
 
     path: Path
     arguments: dict = field(default_factory=dict)
     history: list[dict] = field(default_factory=list)
     record: dict | None = None
-    evaluations: dict[str, AnyReport] = field(default_factory=dict)
+    evaluations: dict[str, Report] = field(default_factory=dict)
 
     @property
     def adapter(self) -> Path | None:
@@ -61,7 +60,7 @@ def read_run(path: str | Path) -> SavedRun:
     if path.suffix in (".yaml", ".yml") and path.is_file():
         return SavedRun(path, _yaml(path))
     if (path / "metrics.json").is_file():
-        return SavedRun(path, evaluations={path.name: _evaluation(path)})
+        return SavedRun(path, evaluations={path.name: Report.load(path)})
     if not ((path / "config.yaml").is_file() or (path / "metrics.jsonl").is_file()):
         raise FileNotFoundError(
             f"{path}: neither a run (config.yaml, metrics.jsonl), an evaluation (metrics.json) nor a YAML file of one"
@@ -75,7 +74,7 @@ def read_run(path: str | Path) -> SavedRun:
     if record.is_file():
         run.record = _json(record, record.read_text(encoding="utf-8"))
     for folder in sorted(child for child in path.iterdir() if (child / "metrics.json").is_file()):
-        run.evaluations[folder.name] = _evaluation(folder)
+        run.evaluations[folder.name] = Report.load(folder)
     return run
 
 
@@ -135,10 +134,3 @@ def _json(path: Path, text: str) -> dict:
         return json.loads(text)
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: not valid JSON: {error}") from None
-
-
-def _evaluation(folder: Path) -> AnyReport:
-    try:
-        return load_report(folder)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"evaluation {folder}: not valid JSON: {error}") from None

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from gift_peft.evaluation.scoring import resize_prediction
+from gift_peft.evaluation.alignment import resize_prediction
 from gift_peft.images import list_images, read_image
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.figures import prediction_row, save_grid

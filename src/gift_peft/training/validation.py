@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from gift_peft.evaluation.evaluate import evaluate_booster, evaluate_gift_i
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.on_booster import evaluate_booster
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.evaluation.results import REGIONS
 from gift_peft.losses import GeometryConsistencyError
 from gift_peft.models.loading import DepthModel

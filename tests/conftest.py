@@ -14,7 +14,6 @@ from helpers.records import records
 from helpers.runs import arguments
 from helpers.tiny import tiny_model, write_base, write_raw_tree
 
-from gift_peft.dataset.gift_i import register
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.training import train
 
@@ -62,7 +61,6 @@ def prepared(tmp_path, raw_tree):
 @pytest.fixture
 def fresh_cache(tmp_path_factory, monkeypatch):
     """No test sees what another, or the user, has cached."""
-    register()
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
 
 

@@ -4,11 +4,13 @@ import json
 import subprocess
 import sys
 
+import datasets
 import numpy as np
 import pytest
 from helpers.booster_tree import write_predictions, write_root
 from helpers.tiny import write_raw_tree
 
+import gift_peft
 from gift_peft import cli, evaluate_booster
 from gift_peft.evaluation.protocols import PROTOCOLS
 from gift_peft.evaluation.results import Report
@@ -49,17 +51,34 @@ def train_arguments(base, tree, out):
 
 def test_help_lists_the_verbs(run):
     code, out, _ = run("--help")
-    assert code == 0
-    for verb in ("demo", "proxies", "train", "evaluate", "predict", "report"):
+    assert code == 0 and "example:" in out
+    for verb in cli.VERBS:
         assert f"\n    {verb} " in out
-        assert run(verb, "--help")[0] == 0
-    assert "--lambda_c" in run("train", "--help")[1]
+    assert "--lambda-c" in run("train", "--help")[1]
 
 
-def test_asking_for_help_imports_nothing_heavy():
-    check = "import sys, gift_peft.cli as c; c._parser(); print({'torch', 'transformers'} & {*sys.modules})"
-    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
+# Prints which of the heavy packages are imported when `gift-peft WORDS` has answered.
+IMPORTED = """
+import contextlib, os, sys
+import gift_peft.cli
+with contextlib.suppress(SystemExit), contextlib.redirect_stdout(open(os.devnull, "w")):
+    gift_peft.cli.main(sys.argv[1:])
+print(*sorted({"torch", "transformers", "datasets", "peft", "cv2", "accelerate", "matplotlib"} & {*sys.modules}))
+"""
+
+
+@pytest.mark.parametrize("words", ["--help", "--version", *(f"{verb} --help" for verb in cli.VERBS)])
+def test_an_answer_waits_for_no_heavy_import(words):
+    done = subprocess.run([sys.executable, "-c", IMPORTED, *words.split()], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_version_names_what_a_report_of_a_mistake_needs(run):
+    code, out, _ = run("--version")
+    assert code == 0
+    versions = dict(line.split() for line in out.splitlines())
+    assert [*versions] == ["gift-peft", "python", "torch", "transformers", "peft", "accelerate", "datasets"]
+    assert versions["gift-peft"] == gift_peft.__version__ and versions["datasets"] == datasets.__version__
 
 
 @pytest.mark.parametrize(
@@ -125,7 +144,7 @@ def test_ctrl_c_before_training_is_130(run, monkeypatch):
     def interrupt(argv):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gift_peft.training.arguments.parse_arguments", interrupt)
+    monkeypatch.setattr("gift_peft.training.__main__.parse_arguments", interrupt)
     assert run("train")[0] == 130
 
 
@@ -205,7 +224,7 @@ def test_demo_passes_training_arguments_on(monkeypatch, run):
     seen = {}
     monkeypatch.setattr("gift_peft.demo.run.run_demo", lambda **given: seen.update(given))
     assert run("demo", "--out", "there", "--seed", "2", "--lambda_d=0")[0] == 0
-    assert seen == {"out": "there", "overwrite_output_dir": False, "seed": 2, "extra": ["--lambda_d=0"]}
+    assert seen == {"out": "there", "overwrite_output_dir": False, "seed": 2, "extra": ["--lambda-d=0"]}
 
 
 @pytest.mark.parametrize("script", ["examples/train_gift.py", "-m gift_peft.training", "-m gift_peft"])

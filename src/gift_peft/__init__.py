@@ -1,12 +1,15 @@
 """Geometry-invariant fine-tuning (GIFT): depth models learn to see mirrors and glass, without depth labels.
 
-Importing the package makes `datasets.load_dataset("gift_i", data_dir=...)` work and transformers' Auto classes know
-VGGT and Metric3D V2. The names below are imported when first used, so that `gift-peft --help` does not wait for torch.
+Makes `datasets.load_dataset("gift_i", data_dir=...)` work and transformers' Auto classes know VGGT and Metric3D V2, as
+soon as these packages are imported. The names below are imported when first used: `import gift_peft` is quick.
 """
 
+import importlib.util
+import sys
+from collections.abc import Callable
 from importlib import import_module
 
-from gift_peft.dataset.gift_i import register
+from gift_peft.dataset import register_builder
 from gift_peft.models import register_models
 
 __version__ = "0.1.0"
@@ -33,9 +36,11 @@ _HOME = {
     "group_consistency_loss": "losses",
     "load_gift_i": "dataset.gift_i",
     "masked_l1": "losses",
+    "prepare_gift_i": "prepare.prepare",
     "save_adapter": "adapters.folder",
     "self_distillation_loss": "losses",
     "set_adapter_scale": "adapters.scale",
+    "train": "training.loop",
 }
 
 __all__ = ["__version__", *sorted(_HOME)]
@@ -53,5 +58,40 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-register()
-register_models()
+class _AfterImport:
+    """An import finder that finds a package where it is, and calls `action` once it has been executed."""
+
+    def __init__(self, package: str, action: Callable[[], None]):
+        self.package, self.action, self.searching = package, action, False
+
+    def find_spec(self, name, path=None, target=None):
+        if name != self.package or self.searching:
+            return None
+        self.searching = True  # so that the other finders are asked
+        try:
+            spec = importlib.util.find_spec(name)
+        finally:
+            self.searching = False
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def exec_module(module):
+                execute(module)
+                # Not before: many packages look for another without importing it.
+                sys.meta_path.remove(self)
+                self.action()
+
+            spec.loader.exec_module = exec_module
+        return spec
+
+
+def when_imported(package: str, action: Callable[[], None]) -> None:
+    """Call `action` at once if `package` is imported, else as soon as it has been."""
+    if package in sys.modules:
+        action()
+    else:
+        sys.meta_path.insert(0, _AfterImport(package, action))
+
+
+when_imported("datasets", register_builder)
+when_imported("transformers", register_models)

@@ -7,16 +7,18 @@ prediction back to each picture's size, as in transformers' pipeline. Values sta
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.colormap import color_range, colorize
 from gift_peft.files import write_whole
 from gift_peft.images import list_images
-from gift_peft.models.loading import DepthModel
+from gift_peft.options import OptionParser, add_adapter, add_base
+
+if TYPE_CHECKING:
+    import torch
 
 
 def predict_images(
@@ -30,7 +32,7 @@ def predict_images(
     kind: str | None = None,
     revision: str | None = None,
     focal_length: float | tuple[float, float] | None = None,
-    device: str | torch.device | None = None,
+    device: "str | torch.device | None" = None,
     progress: bool = True,
 ) -> list[Path]:
     """Writes `<stem>.npy` and `<stem>.png` per picture and, with an adapter, `<stem>_base.npy/.png` beside them.
@@ -53,6 +55,9 @@ def predict_images(
         FileNotFoundError: a picture, base or adapter that is not there. ValueError: an unreadable picture, a
             non-finite prediction, an adapter for another base.
     """
+    from gift_peft.colormap import color_range, colorize  # not for `--help`, which needs neither OpenCV nor torch
+    from gift_peft.models.loading import DepthModel
+
     files = list_images(images)
     names = _unique_names(files, beside=adapter is not None)
     model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
@@ -92,4 +97,36 @@ def _unique_names(files: Sequence[Path], beside: bool) -> list[str]:
     return names
 
 
-# ---- adapters ----
+# ---- the verb ----
+
+
+def make_parser() -> OptionParser:
+    parser = OptionParser(
+        "predict",
+        "Depth of pictures, beside the base's.",
+        "gift-peft predict photo.jpg --base demo/base --adapter demo/adapter --out depth",
+    )
+    parser.add_argument("images", nargs="+", metavar="IMAGE", help="picture files or folders of them")
+    add_base(parser)
+    add_adapter(parser)
+    text = "of the camera that took the pictures, where the model takes one (Metric3D)"
+    parser.add_argument("--focal-length", type=float, metavar="PIXELS", help=text)
+    parser.add_argument("--out", "--output-dir", required=True, metavar="DIR", help="folder for the npy and png files")
+    return parser
+
+
+def run(argv: Sequence[str]) -> int:
+    args = make_parser().parse_args(argv)
+    files = predict_images(
+        args.images,
+        args.base,
+        args.adapter,
+        args.adapter_scale,
+        out=args.out,
+        size=args.size,
+        kind=args.kind,
+        revision=args.revision,
+        focal_length=args.focal_length,
+    )
+    print(f"Depth maps written to {args.out}: {len(files)}")
+    return 0

@@ -14,7 +14,7 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation, pipeline
 
-from gift_peft.models import convert, register_models
+from gift_peft.models import convert
 from gift_peft.models.convert import CONVERTERS
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
 from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil
@@ -25,12 +25,6 @@ CLASSES = {
 }
 INSTALLED_WITH_TRANSFORMERS = {"torch", "numpy", "transformers", "safetensors", "huggingface_hub"}
 OTHER = {"vggt": "metric3d", "metric3d": "vggt"}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def registered():
-    register_models()
-    register_models()  # which may be called again
 
 
 def official(name):
@@ -213,34 +207,3 @@ def test_the_folder_works_without_this_package(case, tmp_path, monkeypatch):
     with torch.no_grad():
         expected = AutoModelForDepthEstimation.from_pretrained(folder)(pixels).predicted_depth
     assert torch.equal(torch.load(tmp_path / "depth.pt"), expected)
-
-
-LAZY = """
-import importlib.util, sys
-from gift_peft.models import register_models
-register_models()
-register_models()
-assert importlib.util.find_spec("transformers") is not None  # a look is no import
-assert "torch" not in sys.modules and "transformers" not in sys.modules
-import transformers.models.dinov2.modeling_dinov2  # a submodule first: its parent registers
-from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation
-model = AutoModelForDepthEstimation.from_config(AutoConfig.for_model("gift_metric3d", variant="small", iters=1))
-assert type(model).__name__ == "Metric3DForDepthEstimation"
-assert type(AutoConfig.for_model("gift_vggt")).__name__ == "VggtConfig"
-"""
-
-
-OURS_FIRST = """
-from gift_peft.models import register_models
-register_models()
-from gift_peft.models.vggt import VggtConfig  # halfway through this, transformers is imported and wants them all
-from transformers import AutoConfig
-assert type(AutoConfig.for_model("gift_vggt")) is VggtConfig
-assert type(AutoConfig.for_model("gift_metric3d")).__name__ == "Metric3DConfig"
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("code", [LAZY, OURS_FIRST])
-def test_registration_waits_for_transformers(code):
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -8,7 +8,6 @@ from PIL import Image
 from transformers import pipeline
 from transformers.modeling_outputs import DepthEstimatorOutput
 
-from gift_peft.models import register_models
 from gift_peft.models.pixels import to_pixel_values
 from gift_peft.models.vggt import VggtForDepthEstimation, VggtImageProcessorPil
 
@@ -102,7 +101,6 @@ def test_pipeline(tiny):
 
 
 def test_auto_classes_know_a_saved_folder(tmp_path, tiny):
-    register_models()
     tiny.save_pretrained(tmp_path)
     VggtImageProcessorPil(size={"height": 28, "width": 42}, keep_aspect_ratio=True).save_pretrained(tmp_path)
     estimate = pipeline("depth-estimation", model=str(tmp_path))

@@ -58,7 +58,7 @@ def test_config_yaml_of_a_run_reads_back(tmp_path):
     [
         ("lerning_rate: 1\n", r"c\.yaml: unknown key 'lerning_rate'; did you mean learning_rate\?"),
         ("config: other.yaml\n", "unknown key 'config'"),
-        ("lora_rank: many\n", "lora_rank.*invalid int value: 'many'"),
+        ("lora_rank: many\n", "lora-rank.*invalid int value: 'many'"),
         ("head: half\n", "head.*invalid choice: 'half'"),
         ("lambda_c: {a: 1}\n", "lambda_c: expected a value"),
         ("- 1\n", "expected lines of the form"),
@@ -83,7 +83,7 @@ def test_missing_config_file():
 def test_unknown_and_missing_arguments():
     with pytest.raises(ValueError, match=r"unknown argument --lora_rnk; did you mean lora_rank\?"):
         parse_arguments([*REQUIRED, "--lora_rnk", "3"])
-    with pytest.raises(ValueError, match="required: --output_dir"):
+    with pytest.raises(ValueError, match="required: --output-dir"):
         parse_arguments(REQUIRED[:4])
     with pytest.raises(ValueError, match="unknown argument stray"):
         parse_arguments([*REQUIRED, "stray"])

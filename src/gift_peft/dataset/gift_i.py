@@ -6,11 +6,9 @@
 
 import glob
 import hashlib
-import inspect
 import os
 import re
 import shlex
-import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,29 +92,6 @@ class GiftI(datasets.GeneratorBasedBuilder):
     def _generate_examples(self, groups, split, root):
         for shard, folder in enumerate(groups):
             yield Key(shard, 0), raw_example(Path(folder), split, Path(root))
-
-
-def register() -> None:
-    """Make `datasets.load_dataset("gift_i", data_dir=RAW)` work; `import gift_peft` calls it. Idempotent.
-
-    Touches one private dictionary of `datasets`, which has no public way since loading scripts were removed.
-    """
-    from datasets import packaged_modules
-
-    from gift_peft import images, rules
-    from gift_peft.captures import annotations, masks, tree
-
-    # The hash names the cache: of everything that decides what a raw tree becomes.
-    lines = [
-        line
-        for module in (sys.modules[__name__], tree, masks, annotations, images, rules)
-        for line in _source_lines(module)
-    ]
-    packaged_modules._PACKAGED_DATASETS_MODULES["gift_i"] = (__name__, packaged_modules._hash_python_lines(lines))
-
-
-def _source_lines(module) -> list[str]:
-    return inspect.getsource(module).splitlines()
 
 
 def _listing_digest(folder: str) -> str:

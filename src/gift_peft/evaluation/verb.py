@@ -1,16 +1,15 @@
 """`gift-peft evaluate`: load, evaluate, print the table, leave the files."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.evaluation.booster_scenes import find_booster
-from gift_peft.evaluation.evaluate import evaluate_booster, evaluate_gift_i
-from gift_peft.evaluation.protocols import get_protocol
-from gift_peft.evaluation.results import Report
-from gift_peft.evaluation.tables import markdown_table, text_table
+from gift_peft.evaluation.protocols import get_protocol, list_protocols
 from gift_peft.files import write_whole
-from gift_peft.models.loading import DepthModel
+from gift_peft.options import OptionParser, add_adapter, add_base, add_dataset, use_color
+
+if TYPE_CHECKING:
+    from gift_peft.evaluation.results import Report
 
 
 def run_evaluation(
@@ -32,8 +31,12 @@ def run_evaluation(
     device: str | None = None,
     color: bool = False,
     progress: bool = True,
-) -> Report:
+) -> "Report":
     """`gift-peft evaluate`: loads, evaluates, prints the table, writes `metrics.json`, `rows.jsonl`, `report.md`."""
+    from gift_peft.dataset.gift_i import load_gift_i
+    from gift_peft.evaluation.evaluate import evaluate_gift_i
+    from gift_peft.models.loading import DepthModel
+
     model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
     groups = load_gift_i(dataset, split, dataset_revision=dataset_revision)
     report = evaluate_gift_i(
@@ -74,11 +77,15 @@ def run_booster(
     device: str | None = None,
     color: bool = False,
     **options: Any,
-) -> Report:
+) -> "Report":
     """`gift-peft evaluate --booster`: as `run_evaluation`, of a base or of stored predictions.
 
     `options` are those of `evaluate_booster`.
     """
+    from gift_peft.evaluation.booster_scenes import find_booster
+    from gift_peft.evaluation.evaluate import evaluate_booster
+    from gift_peft.models.loading import DepthModel
+
     if predictions is not None:
         report = evaluate_booster(root, predictions=predictions, kind=kind, **options)
     else:
@@ -98,9 +105,87 @@ def run_booster(
     return report
 
 
-def write_report(report: Report, out: str | Path, color: bool = False) -> None:
+def write_report(report: "Report", out: str | Path, color: bool = False) -> None:
     """Leaves the report in a folder and prints its table."""
+    from gift_peft.evaluation.tables import markdown_table, text_table
+
     folder = report.save(out)
     write_whole(folder / "report.md", markdown_table(report))
     print(text_table(report, color=color))
     print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
+
+
+def make_parser() -> OptionParser:
+    parser = OptionParser(
+        "evaluate",
+        "Compare base and adapter on validation groups, or on Booster.",
+        "gift-peft evaluate --base demo/base --adapter demo/adapter --dataset demo/gift-i",
+    )
+    add_base(parser, required=False)
+    add_dataset(parser, required=False)
+    add_adapter(parser)
+    parser.add_argument("--dataset-revision", metavar="REVISION", help="branch, tag or commit of a hub dataset")
+    parser.add_argument("--split", default="validation", help="of GIFT-I")
+    parser.add_argument("--reference", choices=["proxy", "depth"], default="proxy", help="what to compare with")
+    parser.add_argument("--protocol", metavar="NAME", help="default: native against proxies, gift against depth")
+    parser.add_argument("--list-protocols", action="store_true", help="print what each does, and its source")
+    parser.add_argument("--prediction-scale", type=float, metavar="X", help="to mm, for protocols that fit no scale")
+    parser.add_argument(
+        "--out", "--output-dir", default="evaluation", metavar="DIR", help="for metrics.json, rows.jsonl, report.md"
+    )
+    booster = parser.add_argument_group("Booster")
+    booster.add_argument("--booster", metavar="ROOT", help="evaluate on Booster instead of GIFT-I")
+    booster.add_argument("--predictions", metavar="DIR", help="stored predictions in place of --base")
+    booster.add_argument("--resize", type=float, default=0.25, metavar="X", help="of the ground truth")
+    booster.add_argument("--occlusion", choices=["all", "noc"], default="all", help="noc: what both cameras see")
+    booster.add_argument("--subset", choices=["balanced", "unbalanced"], help="default: balanced, else what there is")
+    booster.add_argument("--partial", action="store_true", help="an incomplete official set is wanted as it is")
+    return parser
+
+
+def run(argv: Sequence[str]) -> int:
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    if args.list_protocols:
+        print(list_protocols())
+        return 0
+    if (args.dataset is None) == (args.booster is None):
+        parser.error("one of --dataset and --booster is required")
+    if (args.base is None) == (args.predictions is None):
+        parser.error("one of --base and --predictions is required")
+    if args.predictions and (args.dataset or args.adapter):
+        parser.error("--predictions go with --booster, and without --adapter")
+    common = {
+        "out": args.out,
+        "adapter_scale": args.adapter_scale,
+        "size": args.size,
+        "kind": args.kind,
+        "revision": args.revision,
+        "prediction_scale": args.prediction_scale,
+        "color": use_color(),
+    }
+    if args.booster:
+        run_booster(
+            args.booster,
+            args.base,
+            args.adapter,
+            predictions=args.predictions,
+            protocol=args.protocol or "gift",
+            resize=args.resize,
+            occlusion=args.occlusion,
+            subset=args.subset,
+            official=False if args.partial else None,
+            **common,
+        )
+    else:
+        run_evaluation(
+            args.base,
+            args.dataset,
+            args.adapter,
+            reference=args.reference,
+            protocol=args.protocol,
+            split=args.split,
+            dataset_revision=args.dataset_revision,
+            **common,
+        )
+    return 0

@@ -4,7 +4,6 @@ and the command line wins."""
 import argparse
 import difflib
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import yaml
 
 from gift_peft.captures.foreign import Layout, read_layout
+from gift_peft.options import OptionParser
 from gift_peft.prepare.matching import RegistrationSettings
 from gift_peft.prepare.quality import QualitySettings
 
@@ -45,38 +45,8 @@ FLAGS = {
     "accept_proposed_masks": "use the proposed masks, which the dataset card then says",
     "paper_exact": "the paper's registration thresholds alone; the report says what the rest would have done",
 }
-EPILOG = """Exit code: 0 if every group is in OUT, 3 if some were rejected (the report says why), 1 if none could
+EXIT_CODES = """Exit code: 0 if every group is in OUT, 3 if some were rejected (the report says why), 1 if none could
 be made, or RAW or a configuration file is wrong, 2 for a wrong command line. Run again, it does what is left to do."""
-
-
-def run(argv: Sequence[str]) -> int:
-    """`gift-peft prepare`: prepare, say in a few lines what came of it, and return the exit code."""
-    from gift_peft.prepare.prepare import prepare_gift_i
-
-    args = parse_arguments(argv)
-    report = prepare_gift_i(
-        args.raw,
-        args.out,
-        args.settings,
-        num_proc=args.num_proc,
-        license=args.license,
-        pretty_name=args.pretty_name,
-    )
-    for entry in report["groups"]:
-        if entry["status"] == "rejected":
-            text = entry["reasons"][0]["text"]
-            print(f"gift-peft: rejected: {entry['split']}/{entry['group_id']}: {text}", file=sys.stderr)
-    for split, found in report["statistics"].items():
-        print(
-            f"{split}: {found['groups']} groups, {found['images']} images ({found['warped_frames']} frames warped, "
-            f"{found['dropped_frames']} dropped), {found['references']} references, "
-            f"{found['rejected_groups']} groups rejected"
-        )
-    print(f"Report: {Path(args.out) / 'report.html'}")
-    kept = sum(found["groups"] for found in report["statistics"].values())
-    if not kept:
-        raise ValueError(f"no group could be prepared; {Path(args.out) / 'report.html'} says why")
-    return 0 if kept == len(report["groups"]) else 3
 
 
 def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
@@ -85,7 +55,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     A wrong command line ends as argparse does it (exit code 2). Raises ValueError or FileNotFoundError naming the YAML
     file and its key.
     """
-    parser = _parser()
+    parser = make_parser()
     given = {key: value for key, value in vars(parser.parse_args(argv)).items() if value is not None}
     config = given.pop("config", None)
     values = {**(_read_config(Path(config)) if config else {}), **given}
@@ -112,13 +82,11 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     )
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="gift-peft prepare",
-        description="From a folder of photos to a checked GIFT-I dataset: register, check, write, report.",
-        epilog=EPILOG,
-        allow_abbrev=False,
-        argument_default=None,
+def make_parser() -> OptionParser:
+    parser = OptionParser(
+        "prepare",
+        f"From a folder of photos to a checked GIFT-I dataset: register, check, write, report.\n\n{EXIT_CODES}",
+        "gift-peft prepare photos gift-i --num-proc 4",
     )
     parser.add_argument("raw", metavar="RAW", help="folder of group folders; it is only read")
     parser.add_argument("out", metavar="OUT", help="prepared folder: new, or made by this command before")
@@ -130,7 +98,6 @@ def _parser() -> argparse.ArgumentParser:
     _add(parser, "pretty_name", metavar="NAME", help="for the dataset card (default: the name of RAW)")
     for name, text in FLAGS.items():
         _add(parser, name, action=argparse.BooleanOptionalAction, help=text)
-    parser.add_argument("--debug", action="store_true", default=None, help="show the traceback of an error")
     for part, kind in PARTS.items():
         group = parser.add_argument_group(f"thresholds of {part}", f"explained in {kind.__module__}.{kind.__name__}")
         for f in fields(kind):
@@ -140,11 +107,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add(parser, name: str, **options) -> None:
-    """Under both spellings, --num_proc and --num-proc."""
-    spellings = dict.fromkeys((f"--{name.replace('_', '-')}", f"--{name}"))
-    if options.get("action") is argparse.BooleanOptionalAction:
-        spellings = {f"--{name.replace('_', '-')}": None}
-    parser.add_argument(*spellings, dest=name, **options)
+    parser.add_argument(f"--{name.replace('_', '-')}", dest=name, default=None, **options)
 
 
 def _raise(message: str):
@@ -180,7 +143,7 @@ def _read_config(path: Path) -> dict:
         raise ValueError(f"config {path}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(values, dict):
         raise ValueError(f"config {path}: expected lines of the form `key: value`")
-    parser = _parser()
+    parser = make_parser()
     parser.error = _raise
     known = {action.dest for action in parser._actions if action.option_strings} - {"config", "help", "debug"}
     argv = []

@@ -9,6 +9,7 @@ import difflib
 import math
 import re
 from dataclasses import asdict, dataclass, field, fields
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Literal, get_origin
 
@@ -16,6 +17,7 @@ import yaml
 
 from gift_peft.files import read_yaml
 from gift_peft.models.pixels import parse_size
+from gift_peft.options import OptionParser
 
 # What a run may be resumed with when it differs: everything else changes the weights that come out.
 FREE_TO_CHANGE = {
@@ -47,17 +49,18 @@ FREE_TO_CHANGE = {
 LENGTH = {"num_train_epochs", "max_steps"}
 
 
-def _arg(text: str, default=...):
-    return field(metadata={"help": text}) if default is ... else field(default=default, metadata={"help": text})
+def _arg(text: str, default=..., aliases: tuple[str, ...] = ()):
+    metadata = {"help": text, "aliases": list(aliases)}
+    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
 
 @dataclass
 class GiftTrainingArguments:
     """Everything a run is told; `--help` prints the texts below. A value out of range is a ValueError naming it."""
 
-    model_name_or_path: str = _arg("the base model: hub id or folder, loaded in float32")
-    dataset_name: str = _arg("GIFT-I: raw tree, prepared folder, parquet release or hub id")
-    output_dir: str = _arg("where the run goes: adapters, checkpoints, metrics.jsonl, config.yaml")
+    model_name_or_path: str = _arg("the base model: hub id or folder, loaded in float32", aliases=("--base",))
+    dataset_name: str = _arg("GIFT-I: raw tree, prepared folder, parquet release or hub id", aliases=("--dataset",))
+    output_dir: str = _arg("where the run goes: adapters, checkpoints, metrics.jsonl, config.yaml", aliases=("--out",))
     config: str | None = _arg("YAML file with values for these arguments; the command line wins", None)
     model_revision: str | None = _arg("branch, tag or commit of the base model", None)
     proxies_dir: str | None = _arg("folder of the teacher's predictions; default: DATASET/proxies", None)
@@ -209,25 +212,39 @@ def parse_arguments(argv: list[str]) -> GiftTrainingArguments:
     Raises ValueError naming the argument: an unknown key (with the nearest known one), a missing one, a wrong type.
     FileNotFoundError if the YAML file does not exist.
     """
-    from transformers import HfArgumentParser
-
     config = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     config.add_argument("--config", type=Path)
     config.error = _raise
     path = config.parse_known_args(argv)[0].config
     from_file = [] if path is None else _yaml_to_argv(path)
-    for word in argv:
-        name = word.lstrip("-").split("=")[0].replace("-", "_")
-        if word.startswith("--") and name not in [*_names(), "help"]:
-            raise ValueError(f"unknown argument {word.split('=')[0]}{_nearest(name)}")
-    parser = HfArgumentParser(GiftTrainingArguments, prog="gift-peft train", allow_abbrev=False)
+    parser = make_parser()
     parser.error = _raise
-    arguments, unknown = parser.parse_args_into_dataclasses(
-        from_file + list(argv), return_remaining_strings=True, look_for_args_file=False
-    )
+    for word in argv:
+        option = word.split("=")[0]
+        if option.startswith("--") and not parser.knows(option):
+            raise ValueError(f"unknown argument {option}{_nearest(option[2:].replace('-', '_'))}")
+    values, unknown = parser.parse_known_args([*from_file, *argv])
     if unknown:
         raise ValueError(f"unknown argument {unknown[0]}")
-    return arguments
+    return GiftTrainingArguments(**vars(values))
+
+
+def make_parser() -> OptionParser:
+    return OptionParser(
+        "train",
+        "Fine-tune a model on groups of images into an adapter.",
+        "gift-peft train --base depth-anything/Depth-Anything-V2-Small-hf --dataset gift-i --out run",
+        parents=[_hf_argument_parser()(GiftTrainingArguments, add_help=False)],
+    )
+
+
+def _hf_argument_parser() -> type[argparse.ArgumentParser]:
+    """transformers' `HfArgumentParser`, from its own file: with transformers come our models, and with them torch."""
+    file = Path(find_spec("transformers").origin).with_name("hf_argparser.py")
+    spec = spec_from_file_location(file.stem, file)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.HfArgumentParser
 
 
 def _raise(message: str):

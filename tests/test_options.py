@@ -1,0 +1,121 @@
+"""Options as they are typed: both spellings of each, the synonyms, the help; what is told of an error."""
+
+import argparse
+import re
+import warnings
+from importlib import import_module
+
+import pytest
+
+from gift_peft.cli import VERBS
+from gift_peft.options import OptionParser, run_verb
+
+SYNONYMS = {
+    "--base": "--model-name-or-path",
+    "--dataset": "--dataset-name",
+    "--out": "--output-dir",
+}
+
+
+@pytest.fixture(params=VERBS)
+def parser(request):
+    """Each verb's parser; a wrong option is a ValueError."""
+    module, _ = VERBS[request.param]
+    parser = import_module(f"gift_peft.{module}").make_parser()
+    parser.error = _raise
+    return parser
+
+
+def _raise(message):
+    raise ValueError(message)
+
+
+def options(parser):
+    """(option, action) of all that take a value, as they stand in the help."""
+    own = [action for action in parser._actions if not isinstance(action, argparse._HelpAction)]
+    return [(option, action) for action in own for option in action.option_strings if option.startswith("--")]
+
+
+def parsed(parser, option, action):
+    """What the option makes of a right value: {dest: value}, without the defaults of others."""
+    count = {"+": 1, "?": 0, None: 1}.get(action.nargs, action.nargs)
+    word = action.choices[0] if action.choices else "2"
+    for other in parser._actions:
+        other.required, other.default = False, argparse.SUPPRESS
+        if not other.option_strings:
+            other.nargs, other.choices = "*", None
+    return vars(parser.parse_args([option, *[str(word)] * count]))
+
+
+def test_every_option_is_taken_with_hyphens_and_underscores(parser):
+    tried = options(parser)
+    assert len(tried) > 1
+    for option, action in tried:
+        hyphens = parsed(parser, option, action)
+        assert hyphens == parsed(parser, f"--{option[2:].replace('-', '_')}", action)
+        assert action.dest in hyphens
+
+
+def test_help_has_one_spelling_and_an_example(parser):
+    text = parser.format_help()
+    assert not re.search(r"--[\w-]*_", text.partition("example:")[0])
+    verb = parser.prog.removeprefix("gift-peft ")
+    example = re.search(rf"\nexample:\n  gift-peft {verb}( .+)$", text.rstrip())
+    parser.parse_args(example.group(1).split())  # is one that it takes itself
+    for option, action in options(parser):
+        assert action.help, option
+
+
+def test_synonyms_mean_the_same_everywhere(parser):
+    known = dict(options(parser))
+    for option, other in SYNONYMS.items():
+        assert known.get(option) is known.get(other), (option, other)
+
+
+def test_values_and_positional_words_keep_their_underscores():
+    parser = OptionParser("try", "text", "gift-peft try")
+    parser.add_argument("word")
+    parser.add_argument("--some-option", action=argparse.BooleanOptionalAction)
+    parser.add_argument("--other-option")
+    args = parser.parse_args(["a_b", "--no_some_option", "--other_option=c_d"])
+    assert (args.word, args.some_option, args.other_option) == ("a_b", False, "c_d")
+    assert parser.parse_args(["a_b", "--other_option", "c_d"]).other_option == "c_d"
+    with pytest.raises(SystemExit):
+        parser.parse_args(["a_b", "--other", "c"])  # no abbreviations
+
+
+@pytest.fixture
+def clean(monkeypatch):
+    """`run_verb` changes these for the rest of a process."""
+    monkeypatch.delenv("GIFT_PEFT_DEBUG", raising=False)
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    for name in ("HF_DATASETS_DISABLE_PROGRESS_BARS", "HF_HUB_DISABLE_PROGRESS_BARS", "TRANSFORMERS_VERBOSITY"):
+        monkeypatch.delenv(name, raising=False)
+    with warnings.catch_warnings():
+        yield
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (ValueError("two\nlines"), 1, "gift-peft: error: two lines\n"),
+        (FileNotFoundError("no such file: a"), 1, "gift-peft: error: no such file: a\n"),
+        (KeyboardInterrupt(), 130, "gift-peft: stopped\n"),
+    ],
+)
+def test_an_error_becomes_a_line_and_an_exit_code(error, code, line, clean, capsys):
+    def run(argv):
+        raise error
+
+    assert run_verb(run, ["--some"]) == code
+    assert capsys.readouterr().err == line
+
+
+def test_debug_is_taken_out_and_lets_the_error_through(clean):
+    seen = []
+    assert run_verb(lambda argv: seen.append(argv) or 3, ["a", "--debug", "--b=c"]) == 3
+    assert seen == [["a", "--b=c"]]
+    with pytest.raises(ValueError, match="as it was"):
+        run_verb(lambda argv: _raise("as it was"), ["--debug"])
+    with pytest.raises(KeyError):  # a mistake of ours is never hidden
+        run_verb(lambda argv: {}["a"], [])

@@ -12,7 +12,7 @@ from torch import nn
 from transformers import DPTConfig, DPTForDepthEstimation, DPTImageProcessorPil
 
 from gift_peft import evaluate_booster
-from gift_peft.evaluation.verb import run_booster, run_evaluation
+from gift_peft.evaluation.verb import run_evaluation
 from gift_peft.models.loading import DepthModel
 from gift_peft.predict import predict_images
 
@@ -107,7 +107,7 @@ def test_moge_is_asked_without_its_mask(packages, name, unit):
 def test_they_stand_in_the_table_and_predict(packages, tmp_path, capsys):
     write_root(tmp_path)
     options = {"size": "70x98", "progress": False}
-    report = run_booster(tmp_path, "moge:known", out=tmp_path / "out", **options)
+    report = run_evaluation("moge:known", booster=tmp_path, out=tmp_path / "out", **options)
     assert report.about["base"] == "moge:known" and not report.adapted and "Booster" in capsys.readouterr().out
     loaded = DepthModel.from_pretrained("moge:known", size="70x98")
     options = {"processor": loaded.processor, "size": loaded.size, "progress": False}
@@ -164,8 +164,8 @@ def test_any_depth_model_of_transformers_is_a_base(tmp_path):
     write_root(tmp_path)
     options = {"out": tmp_path / "out", "progress": False, "size": "64x64"}
     with pytest.raises(ValueError, match='no recipe says what dpt predicts: kind="depth"'):
-        run_booster(tmp_path, base, **options)
-    report = run_booster(tmp_path, base, kind="inverse_depth", **options)
+        run_evaluation(base, booster=tmp_path, **options)
+    report = run_evaluation(base, booster=tmp_path, kind="inverse_depth", **options)
     assert report.counts["scored"] == 4 and report.about["kind"] == "inverse_depth"
 
 

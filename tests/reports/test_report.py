@@ -20,7 +20,7 @@ from PIL import Image
 
 from gift_peft import cli
 from gift_peft.evaluation.results import Report
-from gift_peft.evaluation.verb import run_booster, run_evaluation
+from gift_peft.evaluation.verb import run_evaluation
 from gift_peft.reports.ablation import ablation_table, is_ablation
 from gift_peft.reports.report import notable_observations, run_report
 from gift_peft.reports.saved_run import SavedRun, read_run, run_names
@@ -312,7 +312,9 @@ def test_booster_has_its_own_tables_and_pictures(run_folder, base_dir, tmp_path,
     write_root(tmp_path / "booster", scenes=3)
     shutil.rmtree(run_folder / "evaluation")
     options = {"kind": "inverse_depth", "resize": 0.5, "progress": False}
-    run_booster(tmp_path / "booster", base_dir, run_folder / "adapter", out=run_folder / "booster", **options)
+    run_evaluation(
+        base_dir, None, run_folder / "adapter", booster=tmp_path / "booster", out=run_folder / "booster", **options
+    )
     run_report([run_folder], card=True)
     folder = run_folder / "report"
     assert "not in it" not in capsys.readouterr().out

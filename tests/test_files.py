@@ -2,10 +2,15 @@
 
 import math
 import os
+from pathlib import Path
 
 import pytest
+from helpers.tiny import tiny_model
 
-from gift_peft.files import jsonable, read_yaml, reason, whole_folder, write_whole
+from gift_peft import get_gift_model, load_gift_i, save_adapter
+from gift_peft.files import is_hub_id, jsonable, portable_name, read_yaml, reason, whole_folder, write_whole
+from gift_peft.models.convert import convert_vggt
+from gift_peft.models.identity import check_base_name
 
 
 def test_a_folder_is_whole_or_absent(tmp_path):
@@ -39,12 +44,13 @@ def test_a_file_stands_in_the_way_of_a_folder(tmp_path):
 
 
 def test_windows_opens_no_folders_to_sync(tmp_path, monkeypatch):
-    """os.open of a folder is PermissionError there; files are still synced."""
+    """os.open of a folder is PermissionError there; files are still synced, which takes the right to write."""
     synced, real = [], os.open
 
     def opens(path, flags, *rest):
         if os.path.isdir(path):
             raise PermissionError(13, "Permission denied", str(path))
+        assert flags & os.O_RDWR
         synced.append(os.path.basename(path))
         return real(path, flags, *rest)
 
@@ -92,3 +98,48 @@ def test_json_holds_no_nan():
 def test_text_is_written_as_utf8(tmp_path):
     write_whole(tmp_path / "a/b.txt", "größe")
     assert (tmp_path / "a/b.txt").read_bytes() == "größe".encode()
+
+
+# ---- on the Hub, or a path here: one rule for every door ----
+
+NO_HUB_IDS = ["a/b/c", "/a/b", "./model", ".", "..", "model/", "owner/", "~/model", "owner/mo del", "a--b", ""]
+
+
+@pytest.mark.parametrize("name", ["owner/model", "model", "Depth-Anything_V2.5", Path("owner/model")])
+def test_a_name_is_on_the_hub_unless_it_is_here(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert is_hub_id(name) and portable_name(name) == str(name)
+    check_base_name(name)
+    (tmp_path / name).mkdir(parents=True)
+    assert not is_hub_id(name) and portable_name(name) == Path(name).name
+    (tmp_path / "file").touch()
+    assert not is_hub_id("file")
+
+
+@pytest.mark.parametrize("name", NO_HUB_IDS)
+def test_what_can_only_be_a_path_is_asked_for_nowhere_else(name, tmp_path, monkeypatch):
+    def never(*args, **kwargs):
+        raise AssertionError("asked the hub")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("huggingface_hub.hf_hub_download", never)
+    monkeypatch.setattr("datasets.load_dataset", never)
+    assert not is_hub_id(name)
+    if Path(name).exists():  # as ".", ".." and "" do
+        return
+    for door in (check_base_name, lambda name: load_gift_i(name, "train")):
+        with pytest.raises(FileNotFoundError, match="no such folder"):
+            door(name)
+    if name != "a/b/c":  # there it is file c of the repository a/b
+        with pytest.raises(FileNotFoundError, match="no such checkpoint file"):
+            convert_vggt(name, "new")
+
+
+def test_the_last_part_of_a_path_is_portable(tmp_path):
+    assert portable_name(tmp_path / "model") == portable_name("a/b/model") == portable_name("~/model") == "model"
+
+
+def test_an_adapter_of_a_path_has_no_base_on_its_card(tmp_path):
+    with pytest.warns(UserWarning, match="others cannot load this adapter"):
+        save_adapter(get_gift_model(tiny_model()), tmp_path / "adapter", "somewhere/else/base")
+    assert "base_model" not in (tmp_path / "adapter" / "README.md").read_text()

@@ -83,24 +83,6 @@ def test_schedule():
     assert model.unused.grad is None
 
 
-def test_larger_snapshot_micro_batches():
-    """Fewer forwards of more images; the last ones are retained and cut as ever."""
-    model, data = toy(torch.float64), group(9)
-    GroupStep(model, retain=0).accumulate(*data)
-    want = gradients(model)
-    for together, retain, seen in (
-        (4, 0, [(4, False), (4, False), (1, False), *[(2, True)] * 4, (1, True)]),
-        (4, 3, [(4, False), (2, False), (2, True), (1, True), *[(2, True)] * 3]),
-        (8, 9, [*[(2, True)] * 4, (1, True)]),
-    ):
-        model.zero_grad()
-        model.seen.clear()
-        step = GroupStep(model, retain=retain, snapshot_micro_batch_size=together)
-        assert step.accumulate(*data).forwards == 18 - retain
-        assert model.seen == seen
-        assert largest_error(gradients(model), want) < 1e-12
-
-
 def test_phases_of_a_step():
     names = []
 
@@ -265,9 +247,6 @@ def test_bad_arguments():
         ({"retain": -1}, "retain must be"),
         ({"retain": "all"}, "retain must be"),
         ({"retain": 1.5}, "retain must be"),
-        ({"snapshot_micro_batch_size": 3, "retain": 0}, "multiple of micro_batch_size 2, got 3"),
-        ({"snapshot_micro_batch_size": 0, "retain": 0}, "multiple of micro_batch_size"),
-        ({"snapshot_micro_batch_size": 4}, "needs a fixed retain"),
     ):
         with pytest.raises(ValueError, match=message):
             GroupStep(toy(), **kwargs)

@@ -9,17 +9,18 @@ The tree has the official set's layout and numbers and no picture of it. It is w
 
 import argparse
 import multiprocessing
-import resource
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 
 from gift_peft import evaluate_booster
 from gift_peft.evaluation.tables import text_table
 from gift_peft.models.pixels import parse_size
+from gift_peft.training.profiling import peak_memory
 
 CALIBRATION = """<?xml version="1.0"?>
 <opencv_storage>
@@ -47,7 +48,7 @@ def main() -> None:
             writer = multiprocessing.get_context("spawn").Process(target=write_tree, args=options)
             writer.start()
             writer.join()
-        before = peak_memory()
+        before = peak_memory(torch.device("cpu")) / 2**20
         start, cpu = time.perf_counter(), time.process_time()
         report = evaluate_booster(
             folder,
@@ -61,13 +62,8 @@ def main() -> None:
     print(text_table(report))
     print(
         f"{report.counts['images']} images of {args.size} in {seconds:.1f} s ({cpu:.1f} s of processor time); peak "
-        f"memory {peak_memory():.0f} MiB, of which {before:.0f} MiB before the first image"
+        f"memory {peak_memory(torch.device('cpu')) / 2**20:.0f} MiB, of which {before:.0f} MiB before the first image"
     )
-
-
-def peak_memory() -> float:
-    """Of this process so far, in MiB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def write_tree(folder: Path, scenes: int, images: int, size: tuple[int, int]) -> None:

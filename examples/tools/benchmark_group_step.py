@@ -199,21 +199,19 @@ def measure_loader(bench: Bench, seconds: float) -> float:
 def measure_options(bench: Bench, size: int, repeats: int, compiled: bool) -> dict[str, float]:
     """Median seconds for the gradient of one group, by default and under what is off by default."""
     variants = {
-        "default": (None, "auto", None),
-        "replay (retain=0)": (None, 0, None),
-        "replay with snapshots of 8": (None, 0, 8),
-        "all retained, blocks checkpointed": (checkpoint_blocks, size, None),
-        "channels-last head": (use_channels_last, "auto", None),
+        "default": (None, "auto"),
+        "replay (retain=0)": (None, 0),
+        "all retained, blocks checkpointed": (checkpoint_blocks, size),
+        "channels-last head": (use_channels_last, "auto"),
     }
     if compiled:
-        variants["compiled blocks"] = (compile_blocks, "auto", None)
+        variants["compiled blocks"] = (compile_blocks, "auto")
     steps = {}
-    for name, (change, retain, together) in variants.items():
+    for name, (change, retain) in variants.items():
         model = get_gift_model(load_base(bench.base)[0]).to(bench.device).eval()
         if change:
             change(model)
-        options = {"accelerator": bench.accelerator, "snapshot_micro_batch_size": together}
-        steps[name] = GroupStep(model, retain=retain, **options)
+        steps[name] = GroupStep(model, retain=retain, accelerator=bench.accelerator)
     group = bench.groups[bench.index[size]]
     seconds: dict[str, list[float]] = {name: [] for name in steps}
     for repeat in range(repeats + 1):

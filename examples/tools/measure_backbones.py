@@ -12,7 +12,6 @@ micro-batches and `--gradient_checkpointing` fit a step of VGGT-1B into 18 GiB i
 import argparse
 import json
 import platform
-import resource
 import sys
 import time
 from importlib.metadata import version
@@ -28,6 +27,7 @@ from gift_peft import (
     VggtForDepthEstimation,
     get_gift_model,
 )
+from gift_peft.training.profiling import peak_memory
 
 BACKBONES = {
     "vggt": lambda: VggtForDepthEstimation(VggtConfig()),
@@ -38,10 +38,7 @@ BACKBONES = {
 
 
 def peak_gib(device: torch.device) -> float:
-    if device.type == "cuda":
-        return round(torch.cuda.max_memory_allocated(device) / 2**30, 2)
-    kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(kib / 2**20, 2)
+    return round(peak_memory(device) / 2**30, 2)
 
 
 def timed(function, device: torch.device) -> tuple[float, object]:

@@ -1,4 +1,7 @@
-"""Files and folders that are whole or absent, whenever their writer is killed; small files read with clear errors."""
+"""Files and folders that are whole or absent, whenever their writer is killed; small files read with clear errors.
+
+And what a name of a model or dataset means: on the Hub, or a path here.
+"""
 
 import math
 import os
@@ -98,6 +101,25 @@ def jsonable(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def is_hub_id(name: str | Path) -> bool:
+    """Whether a model or dataset of this name is on the Hub: `name` or `owner/name`, and no file or folder here.
+
+    What is neither (`a/b/c`, `./x`, `x/`, `/x`, `~/x`) can only be a path that is wrong, or of another machine.
+    """
+    from huggingface_hub.utils import validate_repo_id
+
+    try:
+        validate_repo_id(str(name))
+    except ValueError:
+        return False
+    return not Path(name).exists()
+
+
+def portable_name(name: str | Path) -> str:
+    """What others may read: a hub id as it is, of a path the last part."""
+    return str(name) if is_hub_id(name) else Path(name).expanduser().resolve().name
+
+
 def _escaped(name: str) -> str:
     return "".join(f"[{character}]" if character in "*?[" else character for character in name)
 
@@ -105,7 +127,7 @@ def _escaped(name: str) -> str:
 def _sync(path: Path) -> None:
     if path.is_dir() and not _OPENS_FOLDERS:
         return
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY if _OPENS_FOLDERS else os.O_RDWR)  # Windows syncs what it may write
     try:
         os.fsync(descriptor)
     finally:

@@ -51,9 +51,6 @@ class GroupStep:
             out of it. On CPU the gradient does not depend on it, to the bit.
         accelerator: its processes share the micro-batches, and its mixed precision ("no" or "bf16") is used. Without
             one: this process alone, bf16 for a model on CUDA, else no. See the attribute `mixed_precision`.
-        snapshot_micro_batch_size: images per forward of the snapshots that are replayed, a multiple of
-            `micro_batch_size`; default the same. Larger ones keep a fast device busier, but then the snapshots' bits
-            are not those of the replays, and depend on `retain`, which must be a number.
 
     Attributes: `budget`, the `GraphBudget` of "auto", else None; `phase`, called with "snapshot", "loss", "replay" and
     "reduce" for a context around each part of a step, to time it.
@@ -68,7 +65,6 @@ class GroupStep:
         micro_batch_size: int = 2,
         retain: int | str = "auto",
         accelerator: Accelerator | None = None,
-        snapshot_micro_batch_size: int | None = None,
     ) -> None:
         if isinstance(micro_batch_size, bool) or not isinstance(micro_batch_size, int) or micro_batch_size < 1:
             raise ValueError(f"micro_batch_size must be a positive integer, got {micro_batch_size!r}")
@@ -79,21 +75,10 @@ class GroupStep:
         kind = str(getattr(accelerator, "distributed_type", "NO")).removeprefix("DistributedType.")
         if kind != "NO" and not kind.startswith("MULTI_"):  # FSDP, DeepSpeed, Megatron ... own weights and backward
             raise ValueError(f"GroupStep needs whole weights on every process: {kind} is not supported, use MULTI_GPU")
-        if snapshot_micro_batch_size is not None:
-            if snapshot_micro_batch_size < 1 or snapshot_micro_batch_size % micro_batch_size:
-                raise ValueError(
-                    f"snapshot_micro_batch_size must be a multiple of micro_batch_size {micro_batch_size}, "
-                    f"got {snapshot_micro_batch_size}"
-                )
-            if retain == "auto":
-                raise ValueError(
-                    "snapshot_micro_batch_size needs a fixed retain: else results would depend on the memory"
-                )
         self.model = model
         self.lambda_c = lambda_c
         self.lambda_d = lambda_d
         self.micro_batch_size = micro_batch_size
-        self.snapshot_micro_batch_size = snapshot_micro_batch_size or micro_batch_size
         self.retain = retain
         self.accelerator = accelerator
         self.mixed_precision = _mixed_precision(model, accelerator)
@@ -192,15 +177,10 @@ class GroupStep:
         done = list(graphs)
         if not kept or mine[0] != kept[0]:
             graphs.clear()
-        # Cut as the replays are, or several micro-batches at a time.
-        together = self.snapshot_micro_batch_size // self.micro_batch_size
-        rest = [index for index in mine if index not in kept and index not in done]
         with torch.no_grad():
-            for chunk in (rest[i : i + together] for i in range(0, len(rest), together)):
-                images = [pixel_values[batches[index]] for index in chunk]
-                predictions = self._predict(images[0] if len(chunk) == 1 else torch.cat(images))
-                for index, part in zip(chunk, predictions.split([len(x) for x in images]), strict=True):
-                    store(batches[index], part)
+            for index in mine:
+                if index not in kept and index not in done:
+                    store(batches[index], self._predict(pixel_values[batches[index]]))
         with torch.enable_grad():
             for index in kept:
                 if index not in graphs:
@@ -265,7 +245,7 @@ class GroupStep:
                 num_images = sum(map(len, graphs.values()))
                 if self.budget is None or not num_images:
                     raise
-            # Out here the error is gone, and with it the frames that held on to tensors.
+            # Outside of `except` the error is gone, and with it the frames whose tensors still took memory.
             graphs.clear()
             self.budget.halve(pixel_values, num_images)
             if torch.cuda.is_available():

@@ -1,4 +1,4 @@
-"""Picture files: find, decode, check and tell apart.
+"""Picture files: find, order, decode, check and digest.
 
 The same rules serve every reader: pictures come upright and in 8-bit RGB, masks as bool, and what cannot be read says
 so in one line that names the file.
@@ -8,7 +8,7 @@ import hashlib
 import io
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -108,11 +108,16 @@ def natural_key(name: str) -> list:
     ]
 
 
+def sort_pictures(paths: Iterable[Path]) -> list[Path]:
+    """Those of the paths that are pictures, in the natural order of their names."""
+    return sorted(filter(is_image_file, paths), key=lambda path: natural_key(path.name))
+
+
 def list_images(images: Sequence[str | Path]) -> list[Path]:
     """Picture files, and those of the folders named; FileNotFoundError or ValueError where there are none."""
     files: list[Path] = []
     for path in map(Path, images):
-        files += _pictures_in(path) if path.is_dir() else [path]
+        files += sort_pictures(path.iterdir()) if path.is_dir() else [path]
     missing = [str(path) for path in files if not path.is_file()]
     if missing:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
@@ -121,7 +126,3 @@ def list_images(images: Sequence[str | Path]) -> list[Path]:
         listed = ", ".join(map(str, images)) or "an empty list"
         raise ValueError(f"no images in {listed} (folders within folders are not searched)")
     return files
-
-
-def _pictures_in(folder: Path) -> list[Path]:
-    return sorted(filter(is_image_file, folder.iterdir()), key=lambda path: natural_key(path.name))

@@ -1,59 +1,116 @@
 """What a group must be, whoever reads it: its name, its number of images, parts of one size, a target to train on."""
 
+from __future__ import annotations
+
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, repeat
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
+
+from gift_peft.images import to_mask, to_rgb
+
+if TYPE_CHECKING:  # torch takes longer to import than the command line takes to answer --help
+    import torch
 
 SPLITS = ("train", "validation")
 SURFACES = ["mirror", "transparent"]
 KINDS = ("depth", "inverse_depth")  # what a model predicts
 
 
-def label_items(group_id: str, names: Sequence[str], kind: str, items: Sequence | None, optional: bool = False):
-    """Pairs (item, how to call it in a message), one per image name; ValueError if their number differs.
+@dataclass(frozen=True, eq=False)
+class GroupPictures:
+    """The decoded parts of one group. It is made by whoever reads them; what takes one checks nothing again.
 
-    `optional`: there may be none at all.
+    Args:
+        group_id (`str`): its name in the dataset.
+        names (`list[str]`): N image names.
+        images (`list[Image.Image]`): N upright 8-bit RGB pictures of one size.
+        masks (`list[np.ndarray]`): N (H, W) bool, the target.
+        valids (`list[np.ndarray]`): N (H, W) bool, False where a warped frame has no pixels; or none.
+        depths (`list[np.ndarray]`): N (H, W) true z-depth in mm, 0 where unknown; or none.
+        reference (`Image.Image`, *optional*): the treated reference.
+        surface (`str`, *optional*): "mirror" or "transparent".
+        proxies (`torch.Tensor`, *optional*): (N, h, w) float32 in native units, if a teacher was named.
+        reference_proxy (`torch.Tensor`, *optional*): (h, w) float32, the teacher's prediction on the reference.
+
+    Raises ValueError, naming the group and the part, unless there is one of each for every name, all of one size.
     """
-    items = [] if items is None else list(items)
-    if len(items) != len(names) and (items or not optional):
-        raise ValueError(f"group {group_id}: {len(names)} image names, but {len(items)} {kind}s")
-    return [(item, f"group {group_id}: the {kind} of {name}") for item, name in zip(items, names, strict=False)]
+
+    group_id: str
+    names: Sequence[str]
+    images: Sequence[Image.Image]
+    masks: Sequence[np.ndarray]
+    valids: Sequence[np.ndarray] = ()
+    depths: Sequence[np.ndarray] = ()
+    reference: Image.Image | None = None
+    surface: str | None = None
+    proxies: torch.Tensor | None = None
+    reference_proxy: torch.Tensor | None = None
+
+    def __post_init__(self) -> None:
+        pictures = [image.size[::-1] for image in self.images]
+        parts = {"image": pictures}
+        for kind, arrays in (("mask", self.masks), ("valid mask", self.valids), ("depth", self.depths)):
+            parts[kind] = [array.shape for array in arrays]
+        for kind, shapes in parts.items():
+            if len(shapes) != len(self.names) and (shapes or kind in ("image", "mask")):
+                raise ValueError(f"group {self.group_id}: {len(self.names)} image names, but {len(shapes)} {kind}s")
+            for name, shape in zip(self.names, shapes, strict=False):
+                self._check_size(f"{kind} of {name}", shape, pictures[0])
+        if self.reference is not None:
+            self._check_size("reference", self.reference.size[::-1], pictures[0])
+
+    def _check_size(self, part: str, shape: tuple[int, ...], size: tuple[int, int]) -> None:
+        if tuple(shape) != size:
+            raise ValueError(
+                f"group {self.group_id}: the {part} is {shape[0]}x{shape[1]} (height x width), "
+                f"but the image {self.names[0]} is {size[0]}x{size[1]}"
+            )
+
+    def check_target(self) -> None:
+        """Raise ValueError unless there is a target somewhere: what a train group needs besides."""
+        if not any(mask.any() for mask in self.masks):
+            raise ValueError(
+                f"group {self.group_id}: every mask is empty, so there is nothing to train on; draw the target in "
+                "255, or name its value in group.yaml (`mask_class: 2`)"
+            )
 
 
-def check_group(
-    group_id: str,
-    names: Sequence[str],
-    images: Sequence[Image.Image],
-    masks: Sequence[np.ndarray],
-    valids: Sequence[np.ndarray] = (),
-    depths: Sequence[np.ndarray] = (),
-    reference: Image.Image | None = None,
-    train: bool = False,
-) -> None:
-    """Raise ValueError unless every part of a group has the size of its images and, in `train`, a target somewhere."""
-    size = images[0].size[::-1]
-    parts = [("image", [image.size[::-1] for image in images])]
-    parts += [(kind, [array.shape for array in arrays]) for kind, arrays in (("mask", masks), ("valid mask", valids))]
-    parts += [("depth", [array.shape for array in depths])]
-    for kind, shapes in parts:
-        for name, shape in zip(names, shapes, strict=False):
-            if tuple(shape) != size:
-                raise ValueError(
-                    f"group {group_id}: the {kind} of {name} is {shape[0]}x{shape[1]} (height x width), "
-                    f"but the image {names[0]} is {size[0]}x{size[1]}"
-                )
-    if reference is not None and reference.size[::-1] != size:
-        raise ValueError(
-            f"group {group_id}: the reference is {reference.height}x{reference.width} (height x width), "
-            f"but the image {names[0]} is {size[0]}x{size[1]}"
-        )
-    if train and not any(mask.any() for mask in masks):
-        raise ValueError(
-            f"group {group_id}: every mask is empty, so there is nothing to train on; draw the target in 255, "
-            "or name its value in group.yaml (`mask_class: 2`)"
-        )
+def parse_group(
+    record: Mapping[str, Any],
+    rgb: Callable[[Any, str], Image.Image] = to_rgb,
+    mask: Callable[[Any, str], np.ndarray] = to_mask,
+    depth: Callable[[Any, str], np.ndarray] = lambda item, _: np.asarray(item),
+) -> GroupPictures:
+    """A record with the dataset's columns as `GroupPictures`; of those after the masks, any may be missing.
+
+    `rgb`, `mask` and `depth` convert an item, given how messages call it; the defaults take pictures, as rows hold
+    them. Raises ValueError as they do, and as `GroupPictures`.
+    """
+    group_id, names = record["group_id"], list(record["image_names"])
+
+    def convert(column: str, kind: str, function: Callable[[Any, str], Any]) -> list:
+        items = record.get(column)
+        called = (f"group {group_id}: the {kind} of {name}" for name in chain(names, repeat("an image too many")))
+        return [] if items is None else [function(*pair) for pair in zip(items, called, strict=False)]
+
+    reference, surface = record.get("reference"), record.get("surface")
+    return GroupPictures(
+        group_id,
+        names,
+        convert("images", "image", rgb),
+        convert("masks", "mask", mask),
+        convert("valids", "valid mask", mask),
+        convert("depths", "depth", depth),
+        None if reference is None else rgb(reference, f"group {group_id}: the reference"),
+        SURFACES[surface] if isinstance(surface, int) else surface,  # of a row, the number of its label
+        record.get("proxies"),
+        record.get("reference_proxy"),
+    )
 
 
 def check_count(group_id: str, count: int, split: str, has_reference: bool) -> None:

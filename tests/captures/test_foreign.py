@@ -10,7 +10,6 @@ from PIL import Image
 from gift_peft.captures.foreign import read_layout
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.prepare.prepare import prepare_gift_i
-from gift_peft.prepare.registration import warp
 from gift_peft.prepare.settings import PrepareSettings
 
 SIZE = (160, 200)
@@ -19,13 +18,12 @@ root: release
 splits: {train: training, validation: val}
 images: rgb/*.png
 mask: mask/{stem}.png
-proxy: proxy/{stem}.npy
 reference: treated/*.png
 """
 
 
 def release(root):
-    """A capture with a moved frame and one with a treated reference, with proxies at half the size."""
+    """A capture with a moved frame and one with a treated reference."""
     shift = motion(np.random.default_rng(0), SIZE, translation=5, degrees=1)
     for split, name, seed, reference, motions in (
         ("training", "hall/mirror 1", 4, False, [shift]),
@@ -33,13 +31,11 @@ def release(root):
     ):
         made = capture(root / "made" / name, seed, count=3, size=SIZE, reference=reference, motions=motions)
         folder = root / "raw/release" / split / name
-        for part in ("rgb", "proxy", *(["treated"] if reference else [])):
+        for part in ("rgb", *(["treated"] if reference else [])):
             (folder / part).mkdir(parents=True)
         shutil.move(made / "masks", folder / "mask")
         for index in range(3):
             shutil.move(made / f"{index}.png", folder / "rgb" / f"{index}.png")
-            proxy = np.random.default_rng(index).random((80, 100)).astype(np.float32)
-            np.save(folder / "proxy" / f"{index}.npy", proxy)
         if reference:
             shutil.move(made / "reference.png", folder / "treated/spray.png")
     return root / "raw"
@@ -61,7 +57,7 @@ def lists(raw):
         ("validation", "val.csv", "val/cup"),
     ):
         del split
-        lines = [f"{folder}/rgb/{k}.png, {folder}/mask/{k}.png, {folder}/proxy/{k}.npy" for k in range(3)]
+        lines = [f"{folder}/rgb/{k}.png, {folder}/mask/{k}.png" for k in range(3)]
         lines += lines[:1]  # listed twice, as the paper's loader allows
         if folder == "val/cup":
             lines = [f"{line}, {folder}/treated/spray.png" for line in lines]
@@ -71,7 +67,7 @@ def lists(raw):
     return """
 root: release
 lists: {train: train.txt, validation: val.csv}
-columns: [image, mask, proxy, reference]
+columns: [image, mask, reference]
 """
 
 
@@ -92,28 +88,11 @@ def test_folders_and_lists_give_the_same_groups(raw, tmp_path):
         assert (one["reference"] is None) == (split == "train")
 
 
-def test_stored_proxies_follow_their_frames_by_the_nearest_pixel(raw, tmp_path):
-    out = tmp_path / "out"
-    report = prepare_gift_i(raw, out, settings(tmp_path, FOLDERS))
-    frame = report["groups"][0]["frames"][0]
-    assert frame["status"] == "warped"
-    given = np.load(raw / "release/training/hall/mirror 1/proxy/0.npy")
-    kept = np.load(out / "proxies_given/train/hall__mirror 1/rgb/0.npy")
-    assert kept.shape == given.shape and set(np.unique(kept)) <= {0.0, *np.unique(given)}
-    big = np.kron(given, np.ones((2, 2), np.float32))  # each proxy pixel is two by two image pixels
-    expected = warp(big, np.array(frame["registration"]["homography"]))[::2, ::2]
-    assert (kept == expected).mean() > 0.5 and np.array_equal(
-        np.load(out / "proxies_given/train/hall__mirror 1/rgb/2.npy"),
-        np.load(raw / "release/training/hall/mirror 1/proxy/2.npy"),
-    )
-
-
 def test_a_missing_file_rejects_its_group(raw, tmp_path):
-    (raw / "release/val/cup/proxy/1.npy").unlink()
-    np.save(raw / "release/training/hall/mirror 1/proxy/1.npy", np.full((8, 8), np.nan))
+    (raw / "release/val/cup/mask/1.png").unlink()
     report = prepare_gift_i(raw, tmp_path / "out", settings(tmp_path, FOLDERS))
-    first, second = (group["reasons"][0]["text"] for group in report["groups"])
-    assert "finite numbers" in first and "missing release/val/cup/proxy/1.npy" in second
+    assert [group["status"] for group in report["groups"]] == ["kept", "rejected"]
+    assert "missing release/val/cup/mask/1.png" in report["groups"][1]["reasons"][0]["text"]
 
 
 @pytest.mark.parametrize(
@@ -123,11 +102,13 @@ def test_a_missing_file_rejects_its_group(raw, tmp_path):
         ("mask: ../../{stem}.png", "not a relative path"),
         ("mask: mask/{name}.png", "the one placeholder is {stem}"),
         ("mask: mask/{stem.__class__}.png", "the one placeholder is {stem}"),
-        ("proxy: 'C:\\proxies\\{stem}.npy'", "not a relative path"),
+        ("reference: 'C:\\treated\\{stem}.png'", "not a relative path"),
+        ("proxy: proxy/{stem}.npy", "unknown key 'proxy'; it may have the keys root,"),
+        ("columns: [image, mask, proxy]", "columns"),
         ("splits: {test: test}", "splits"),
         ("columns: [image, image]", "columns"),
         ("colums: [image]", "it may have the keys"),
-        ("- a", "it may have the keys"),
+        ("- a", "`key: value`"),
         ("a: [", "not valid YAML"),
     ],
 )

@@ -5,6 +5,8 @@ import pickle
 import shutil
 import subprocess
 import sys
+from importlib.resources import files
+from pathlib import Path
 
 import datasets
 import numpy as np
@@ -17,9 +19,14 @@ from helpers.tiny import SIZE, tiny_processor, write_group, write_raw_tree
 from PIL import Image
 from torch.utils.data import DataLoader
 
+from gift_peft.dataset.cache import GroupCache
 from gift_peft.dataset.gift_i import FEATURES, GiftI, dataset_fingerprint, gift_i_splits, load_gift_i
+from gift_peft.dataset.rows import parsed
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.dataset.writer import SCHEMA, write_gift_i
+from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.rules import GroupPictures
+from gift_peft.training.teacher import make_proxies
 
 CLEARGRASP = os.path.join(os.path.dirname(__file__), "..", "..", "..", "shared", "data", "cleargrasp_d435")
 
@@ -39,6 +46,22 @@ def test_plain_load_dataset_reads_the_prepared_folder(prepared):
     assert row["depths"][0].mode == "I;16" and row["reference"].size == (80, 60)
     schemas = [pq.read_schema(prepared / split / "metadata.parquet") for split in ("train", "validation")]
     assert schemas[0] == schemas[1] == SCHEMA
+
+
+def test_a_folder_of_pictures_kept_from_before():
+    """One embedded group in the form in which the package used to ship them; its shards hold the same files."""
+    folder = Path(__file__).parents[1] / "fixtures" / "prepared"
+    loose = load_gift_i(folder, "validation")
+    shipped = load_gift_i(str(files("gift_peft.demo") / "gift-i"), "validation")
+    same = shipped.select([shipped["group_id"].index("mirror_003")])
+    assert dataset_fingerprint(loose) == dataset_fingerprint(same)
+    assert len(loose) == 1 and loose["image_names"] == same["image_names"] and loose["surface"] == same["surface"]
+    for own, other in zip(loose[0]["depths"], same[0]["depths"], strict=True):
+        assert np.array_equal(np.asarray(own), np.asarray(other))
+    plain = datasets.load_dataset(str(folder), split="validation", features=FEATURES)[0]
+    assert [np.asarray(image).tolist() for image in plain["images"]] == [
+        np.asarray(image).tolist() for image in same[0]["images"]
+    ]
 
 
 @pytest.mark.parametrize("name", ["data [v2]", "what?", "50 % *", "Küche (alt)"])
@@ -75,7 +98,43 @@ def test_streaming_workers_and_slices(prepared):
     group = collate_group(row, tiny_processor(), SIZE)
     again = collate_group(load_gift_i(prepared, "validation")[0], tiny_processor(), SIZE)
     assert group.surface == "mirror" and torch.equal(group.pixel_values, again.pixel_values)
-    assert torch.equal(group.mask, again.mask) and torch.equal(group.depths[1], again.depths[1])
+    assert torch.equal(group.mask, again.mask) and np.array_equal(group.pictures.depths[1], again.pictures.depths[1])
+
+
+def test_inside_the_package_a_group_is_parsed_once(prepared, base_dir, monkeypatch):
+    made = []
+    check = GroupPictures.__post_init__
+    monkeypatch.setattr(GroupPictures, "__post_init__", lambda self: made.append(self.group_id) or check(self))
+    rows = load_gift_i(prepared, "validation")
+    group = parsed(rows)[0]
+    assert isinstance(group, GroupPictures) and group.surface == "mirror" and made == ["scene_100"]
+    assert (group.images[0].mode, group.masks[0].dtype, group.depths[0].dtype) == ("RGB", bool, np.uint16)
+    whole = collate_group(group, tiny_processor(), SIZE)
+    assert whole.pictures is group and made == ["scene_100"]
+    row = collate_group(rows[0], tiny_processor(), SIZE)  # a dict may have been changed, so it is parsed where taken
+    assert torch.equal(row.mask, whole.mask) and torch.equal(row.pixel_values, whole.pixel_values)
+    assert parsed([rows]) == [rows]
+    for read in (
+        lambda: dataset_fingerprint(rows),
+        lambda: make_proxies(base_dir, prepared, ["validation"], SIZE),
+        lambda: GroupCache(rows, tiny_processor(), SIZE, None).read(0),
+    ):
+        made.clear()
+        read()
+        assert made == ["scene_100"]
+
+
+def test_hand_made_rows_are_evaluated_as_ours(prepared):
+    rows = load_gift_i(prepared, "validation")
+    options = {"reference": "depth", "kind": "depth", "processor": tiny_processor(), "size": SIZE, "progress": False}
+    want = evaluate_gift_i(rows, lambda pixels: pixels[:, 0], **options)
+    columns = ("group_id", "image_names", "images", "masks", "depths")
+    row = {key: rows[0][key] for key in columns} | {"surface": "mirror"}  # what else there may be is left out
+    report = evaluate_gift_i([row], lambda pixels: pixels[:, 0], **options)
+    assert report.rows == want.rows
+    row["masks"] = [mask.crop((0, 0, 20, 20)) for mask in row["masks"]]
+    with pytest.raises(ValueError, match=r"group scene_100: the mask of 0\.png is 20x20"):
+        evaluate_gift_i([row], lambda pixels: pixels[:, 0], **options)
 
 
 def test_rows_behave_as_a_dataset(prepared):

@@ -242,11 +242,10 @@ def test_collate_group():
     assert group.mask.float().mean().item() == pytest.approx(200 / 2400, abs=0.01)
     assert not group.valid[:, :, :35].any() and group.valid[:, :, 35:].all()
     assert torch.equal(group.target, proxies) and torch.equal(group.reference_target, proxies[0])
-    assert group.depths[1].dtype == torch.float32 and np.array_equal(group.depths[1].numpy(), depth.astype(np.float32))
+    assert np.array_equal(group.pictures.depths[1], depth) and group.pictures.masks[0].sum() == 200
     plain = collate_group(row(), tiny_processor(), SIZE)
-    assert (
-        plain.valid is plain.target is plain.reference_target is plain.reference_pixel_values is plain.depths is None
-    )
+    assert plain.valid is plain.target is plain.reference_target is plain.reference_pixel_values is None
+    assert not plain.pictures.depths and not plain.pictures.valids
 
 
 def small(dtype=np.uint8):

@@ -1,6 +1,7 @@
 """The demo on a three-group stand-in, and what the embedded assets promise."""
 
 import json
+import os
 from importlib.resources import files
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from PIL import Image
 from transformers import AutoModelForDepthEstimation
 
 from gift_peft import load_gift_i
+from gift_peft.dataset.export import export_parquet
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.demo import run
 
@@ -40,7 +42,8 @@ def embedded(tmp_path, monkeypatch):
     root = tmp_path / "package"
     write_base(root / "base")
     for split in ("train", "validation"):
-        write_gift_i(groups(split), root / "gift-i", license="apache-2.0")
+        write_gift_i(groups(split), tmp_path / "loose", license="apache-2.0")
+    export_parquet(tmp_path / "loose", root / "gift-i")
     monkeypatch.setattr(run, "files", lambda package: root)
     return root
 
@@ -56,6 +59,11 @@ def test_demo_leaves_everything_it_promises(embedded, tmp_path, monkeypatch, cap
         assert picture.width > 1000
     text = Path("demo/report.md").read_text()
     assert all(label in text for label in run.KINDS.values()) and "consensus" in text.lower()
+    assert sorted(os.listdir("demo/gift-i")) == ["README.md", "data", "proxies"]  # what `export` writes, and proxies
+    assert "(validation.html)" in text
+    page = Path("demo/validation.html").read_text()
+    assert page.count("<img ") == 9 and page.count("treated reference</figcaption>") == 3
+    assert all(f"<h2>{kind}_000, " in page for kind in KINDS) and "http" not in page and "<script" not in page
     # The adapter names its base by the path demo/base.
     assert json.loads(Path("demo/adapter/adapter_config.json").read_text())["base_model_name_or_path"] == "demo/base"
     model = AutoModelForDepthEstimation.from_pretrained("demo/adapter").eval()

@@ -277,7 +277,7 @@ def test_bad_predictions_and_arguments_are_named():
         evaluate_gift_i([group])
     with pytest.raises(ValueError, match="no groups"):
         evaluate([])
-    with pytest.raises(ValueError, match="no group of the dataset has true depth"):
+    with pytest.raises(ValueError, match='reference="depth" needs the rows of load_gift_i'):
         evaluate([group], reference="depth", kind="depth")
 
 

@@ -67,6 +67,11 @@ def test_modes_and_gradients_are_left_as_they_were(raw_tree, adapter_model):
     assert [weight.requires_grad for weight in adapter_model.parameters()] == flags
 
 
+def test_a_dataset_without_true_depth_is_told(raw_tree):
+    with pytest.raises(ValueError, match="no group of the dataset has true depth"):
+        evaluate_gift_i(raw_tree, tiny_model(), processor=tiny_processor(), reference="depth", progress=False)
+
+
 def test_the_train_split_has_gce_and_no_accuracy(raw_tree, adapter_model):
     report = evaluate_gift_i(load_gift_i(raw_tree, "train"), shake(adapter_model), size=SIZE, progress=False)
     assert report.gce["num_groups"] == 2 and report.counts["scored"] == 0 and report.counts["images"] == 5

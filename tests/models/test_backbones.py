@@ -10,7 +10,7 @@ from helpers.tiny import tiny_model, tiny_processor, write_raw_tree
 from peft import PeftModel, get_peft_model_state_dict
 from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
-from gift_peft import set_adapter_scale
+from gift_peft import get_gift_model, set_adapter_scale
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.models.metric3d import Metric3DImageProcessorPil
@@ -53,13 +53,12 @@ def test_from_pictures_to_an_evaluated_adapter(name, head, tree, tmp_path, monke
     make_processor().save_pretrained(base)
     files = {path.name: path.read_bytes() for path in base.iterdir()}
     models = []
-    make_run = loop.Run
 
-    def run(*args):
-        models.append(make_run(*args))
+    def keep(*args, **options):
+        models.append(get_gift_model(*args, **options))
         return models[-1]
 
-    monkeypatch.setattr(loop, "Run", run)
+    monkeypatch.setattr(loop, "get_gift_model", keep)
     args = arguments(
         base,
         tree,
@@ -77,7 +76,7 @@ def test_from_pictures_to_an_evaluated_adapter(name, head, tree, tmp_path, monke
     assert result.metrics[0]["distillation"] == 0
     assert result.metrics[-1]["loss"] < result.metrics[0]["loss"]
 
-    trained = models[0].model
+    trained = models[0]
     teacher = AutoModelForDepthEstimation.from_pretrained(base)
     processor = AutoImageProcessor.from_pretrained(base, backend="pil")
     rows = load_gift_i(tree, "train")

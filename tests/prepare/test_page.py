@@ -203,6 +203,17 @@ def test_what_the_page_says(out, report):
     assert sorted(kinds) == ["", "", "", "outside", "proposed", "proposed", "proposed", "proposed"]
 
 
+def test_the_papers_rule_is_shown_only_where_it_was_asked(out, report):
+    text = write_html(out, report).read_text(encoding="utf-8")
+    assert "the paper&#x27;s rule alone" in text
+    for found in report["groups"][0]["frames"]:
+        (found["registration"] or {}).pop("paper_exact", None)
+    text = write_html(out, report).read_text(encoding="utf-8")
+    words = " ".join(" ".join(Page(text).words).split())
+    assert "rule alone" not in text and "accepts" not in text
+    assert "2.png features 250 240 0.96 0.40 3.21 3.30 4.5 – 0.080 9.50 1.25 –" in words
+
+
 def test_nothing_outside_the_file_and_no_scripts(out, report):
     text = write_html(out, report).read_text(encoding="utf-8")
     page = Page(text)

@@ -6,7 +6,8 @@ import pytest
 from helpers.photos import scene, target, with_content
 
 from gift_peft.prepare import quality
-from gift_peft.prepare.quality import QualitySettings, Small, check_group_change, pairwise_changes
+from gift_peft.prepare.quality import SmallFrame, check_group_change, pairwise_changes
+from gift_peft.prepare.settings import QualitySettings
 
 SIZE = (240, 320)
 
@@ -23,7 +24,7 @@ def group(seed, noise=3.0, count=2):
 
 
 def smalls(grays, mask):
-    return [Small(image, mask, None) for image in grays]
+    return [SmallFrame(image, mask, None) for image in grays]
 
 
 def check_frames(names, frames, grays, target_frame, settings):
@@ -36,9 +37,9 @@ def test_only_the_target_changed(seed):
     one, other = smalls(grays, mask)
     assert quality.outside_change(one, other) < 0.003 and quality.outside_correlation(one, other) > 0.8
     assert quality.target_change(one, other) > 5
-    darker = Small((grays[0] * 0.6).astype(np.uint8), mask, None)
+    darker = SmallFrame((grays[0] * 0.6).astype(np.uint8), mask, None)
     assert quality.outside_change(darker, other) < 0.003  # light is no change of the scene
-    assert quality.target_change(darker, Small(grays[0], mask, None)) < 1.5
+    assert quality.target_change(darker, SmallFrame(grays[0], mask, None)) < 1.5
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -50,7 +51,7 @@ def test_something_else_changed(seed):
     one, other = smalls(grays, mask)
     assert quality.outside_change(one, other) > 0.003
     _, reasons, warnings = check_frames(["a", "b"], [one, other], grays, 1, QualitySettings())
-    assert not reasons[0] and "outside_change" in [item["code"] for item in warnings[0]]
+    assert not reasons[0] and "outside_change" in [item.code for item in warnings[0]]
 
 
 def test_another_scene():
@@ -58,7 +59,7 @@ def test_another_scene():
         mask = target(seed, SIZE)
         one, other = smalls([gray(scene(seed, SIZE)), gray(scene(seed + 60, SIZE))], mask)
         _, reasons, _ = check_frames(["a", "b"], [one, other], [one.gray, other.gray], 1, QualitySettings())
-        assert {"another_scene", "outside_change"} & {item["code"] for item in reasons[0]}
+        assert {"another_scene", "outside_change"} & {item.code for item in reasons[0]}
 
 
 def test_target_change_is_the_mean_difference_inside():
@@ -88,17 +89,17 @@ def test_figures_of_single_frames():
 def test_masks_and_their_warnings():
     grays, mask = group(1, count=3)
     shifted = np.roll(mask, 25, axis=1)
-    frames = [Small(image, one, None) for image, one in zip(grays, (mask, mask, shifted), strict=True)]
+    frames = [SmallFrame(image, one, None) for image, one in zip(grays, (mask, mask, shifted), strict=True)]
     figures, _, warnings = check_frames(list("abc"), frames, grays, 0, QualitySettings())
-    assert figures[0]["mask_iou"] == 1 and figures[2]["mask_iou"] < 0.8
-    assert "mask_disagrees" in [item["code"] for item in warnings[2]]
-    assert figures[0]["mask_area"] == pytest.approx(mask.mean(), abs=0.02)
+    assert figures[0].mask_iou == 1 and figures[2].mask_iou < 0.8
+    assert "mask_disagrees" in [item.code for item in warnings[2]]
+    assert figures[0].mask_area == pytest.approx(mask.mean(), abs=0.02)
     border = np.zeros(SIZE, bool)
     border[:, :100] = True
-    edge = [Small(image, border, None) for image in grays]
+    edge = [SmallFrame(image, border, None) for image in grays]
     figures, _, warnings = check_frames(list("abc"), edge, grays, 0, QualitySettings())
-    assert figures[0]["mask_border"] == pytest.approx((60 + 25 + 25) / (2 * 80 + 2 * 60), abs=0.02)
-    assert "mask_border" in [item["code"] for item in warnings[0]]
+    assert figures[0].mask_border == pytest.approx((60 + 25 + 25) / (2 * 80 + 2 * 60), abs=0.02)
+    assert "mask_border" in [item.code for item in warnings[0]]
 
 
 def test_a_group_that_teaches_nothing():
@@ -110,7 +111,7 @@ def test_a_group_that_teaches_nothing():
     grays, mask = group(2)
     assert check_group_change(pairwise_changes(smalls(grays, mask)), QualitySettings())[1] is None
     assert check_group_change(pairwise_changes(smalls(grays[:1], mask)), QualitySettings()) == (None, None)
-    apart = [Small(grays[0], mask, None), Small(grays[1], np.roll(mask, 120, axis=0), None)]
+    apart = [SmallFrame(grays[0], mask, None), SmallFrame(grays[1], np.roll(mask, 120, axis=0), None)]
     assert "no two frames overlap" in check_group_change(pairwise_changes(apart), QualitySettings())[1]
 
 
@@ -120,4 +121,4 @@ def test_a_thin_target_is_still_one():
     thin[100:102, 40:280] = True
     one, other = smalls(grays, thin)
     assert one.mask_area == thin.mean() and one.inside.any() and quality.target_change(one, other) is not None
-    assert not Small(grays[0], np.zeros(SIZE, bool), None).inside.any()
+    assert not SmallFrame(grays[0], np.zeros(SIZE, bool), None).inside.any()

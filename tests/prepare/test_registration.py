@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from gift_peft.prepare import homography
-from gift_peft.prepare.matching import Frame, RegistrationSettings
+from gift_peft.prepare import homography, registration
+from gift_peft.prepare.matching import Frame, match_frames
 from gift_peft.prepare.registration import difference_outside, register, valid_area, warp
+from gift_peft.prepare.settings import RegistrationSettings
 
 SETTINGS = RegistrationSettings()
 SHARED = os.path.join(os.path.dirname(__file__), "..", "..", "..", "shared", "data")
@@ -126,7 +127,7 @@ def test_motion_beyond_the_bound_is_dropped_and_called_that(seed, name, truth):
     rng = np.random.default_rng(seed)
     frame, there = moved(picture, mask, truth(480, 360), rng)
     result = register(Frame(frame, there, SETTINGS), fixed)
-    assert result.status == "dropped" and result.reasons[0]["code"] == "moved_too_far", result
+    assert result.status == "dropped" and result.reasons[0].code == "moved_too_far", result
 
 
 def test_featureless_frames_are_dropped_and_called_that():
@@ -140,8 +141,8 @@ def test_featureless_frames_are_dropped_and_called_that():
         bare = Frame(frame, mask, SETTINGS)
         for moving, fixed in ((bare, textured), (textured, bare)):
             result = register(moving, fixed)
-            assert result.status == "dropped" and result.reasons[0]["code"] == "featureless", result
-            assert "static_rig" in result.reasons[0]["text"]
+            assert result.status == "dropped" and result.reasons[0].code == "featureless", result
+            assert "static_rig" in result.reasons[0].text
 
 
 def test_another_scene_is_dropped_and_called_that():
@@ -149,7 +150,7 @@ def test_another_scene_is_dropped_and_called_that():
     for seed in range(4):
         _, _, fixed = frames(seed, size)
         result = register(Frame(scene(seed + 50, size), target(seed + 50, size), SETTINGS), fixed)
-        assert result.status == "dropped" and result.reasons[0]["code"] == "no_match", result
+        assert result.status == "dropped" and result.reasons[0].code == "no_match", result
 
 
 def test_a_still_camera_is_not_resampled():
@@ -159,13 +160,13 @@ def test_a_still_camera_is_not_resampled():
         frame = with_content(picture * 0.8 + 10, mask, rng)
         result = register(Frame(frame, mask, SETTINGS), fixed)
         assert result.status == "identity" and np.array_equal(result.matrix, np.eye(3))
-        assert result.figures["median_displacement"] < 0.5
+        assert result.figures.median_displacement < 0.5
 
 
 def test_a_declared_static_rig_is_not_even_measured():
     _, mask, fixed = frames(0)
     result = register(Frame(np.zeros((360, 480, 3), np.uint8), mask, SETTINGS), fixed, declared_static=True)
-    assert result.status == "identity" and result.method == "declared static"
+    assert result.status == "identity" and result.figures.method == "declared static"
 
 
 def test_a_turn_about_the_features_does_not_pass_as_standing_still():
@@ -194,8 +195,25 @@ def test_changes_inside_the_target_do_not_steer():
     assert result.status == "identity"
     exact = RegistrationSettings(paper_exact=True)
     by_the_paper = register(*(Frame(image, mask, exact) for image in noisy))
-    assert by_the_paper.figures["with_additions"]["status"] == "identity"
+    assert by_the_paper.figures.with_additions["status"] == "identity"
     assert by_the_paper.status == "dropped" or abs(by_the_paper.matrix - np.eye(3)).max() > 1e-3
+
+
+def test_frames_are_matched_by_the_paper_only_when_it_decides(monkeypatch):
+    calls = []
+
+    def counted(moving, fixed, contrast, outside_only=True):
+        calls.append("ours" if outside_only else "the paper's")
+        return match_frames(moving, fixed, contrast, outside_only)
+
+    monkeypatch.setattr(registration, "match_frames", counted)
+    picture, mask, fixed = frames(0)
+    frame = with_content(picture, mask, np.random.default_rng(0))
+    result = register(Frame(frame, mask, SETTINGS), fixed)
+    assert set(calls) == {"ours"} and result.figures.paper_exact is None
+    exact = RegistrationSettings(paper_exact=True)
+    result = register(Frame(frame, mask, exact), Frame(picture, mask, exact))
+    assert calls.count("the paper's") == 1 and result.figures.paper_exact["accepted"] is True
 
 
 def test_treated_reference_passes_by_its_pixels():
@@ -205,9 +223,9 @@ def test_treated_reference_passes_by_its_pixels():
     treated = picture.copy()
     treated[mask] = 150
     result = register(Frame(treated, mask, strict), Frame(picture, mask, strict), treated=True)
-    assert result.status == "identity" and result.method == "pixels" and result.warnings[0]["code"] == "by_pixels"
+    assert result.status == "identity" and result.figures.method == "pixels" and result.warnings[0].code == "by_pixels"
     exact = RegistrationSettings(paper_exact=True)  # the paper leaves references alone
-    assert register(Frame(treated, mask, exact), Frame(picture, mask, exact), treated=True).method == "paper"
+    assert register(Frame(treated, mask, exact), Frame(picture, mask, exact), treated=True).figures.method == "paper"
     other = register(Frame(scene(9, (360, 480)), mask, strict), Frame(picture, mask, strict), treated=True)
     assert other.status == "dropped"
 
@@ -228,7 +246,7 @@ def test_settings_are_obeyed():
     ):
         other = RegistrationSettings(**{name: value})
         result = register(Frame(frame, there, other), Frame(picture, mask, other))
-        assert result.status == "dropped" and code in [item["code"] for item in result.reasons], (name, result)
+        assert result.status == "dropped" and code in [item.code for item in result.reasons], (name, result)
     still = RegistrationSettings(identity_displacement=20)
     assert register(Frame(frame, there, still), Frame(picture, mask, still)).status in ("identity", "warped")
 
@@ -257,7 +275,7 @@ def test_booster_illuminations_are_identity():
     ]
     for index in (0, 1):
         result = register(photos[index], photos[2])
-        assert result.status == "identity" and result.figures["median_displacement"] < 0.1, result
+        assert result.status == "identity" and result.figures.median_displacement < 0.1, result
 
 
 @REAL

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gift_peft.reports import curves
-from gift_peft.reports.curves import COLORS, DASHES, draw_dynamics, draw_retention, normalised, smooth
+from gift_peft.reports.curves import COLORS, DASHES, draw_dynamics, draw_retention, normalized, smooth
 
 pytest.importorskip("matplotlib")
 
@@ -17,11 +17,11 @@ def history(values, key="val_gce", **more):
 
 
 def test_curves_start_at_one_and_leave_out_what_was_not_measured():
-    epochs, values = normalised(history([0.5, 0.25, None, 1.0]), "val_gce")
+    epochs, values = normalized(history([0.5, 0.25, None, 1.0]), "val_gce")
     assert epochs == [0, 1, 3] and values == [1, 0.5, 2]
-    assert normalised(history([0.5, 0.25]), "booster_tom_rmse") == ([], [])
+    assert normalized(history([0.5, 0.25]), "booster_tom_rmse") == ([], [])
     with pytest.raises(ValueError, match="val_gce is 0 at step 0"):
-        normalised(history([0.0, 0.25]), "val_gce")
+        normalized(history([0.0, 0.25]), "val_gce")
 
 
 @given(st.lists(st.floats(-100, 100), min_size=1, max_size=30), st.sampled_from([1, 3, 5, 9]))

@@ -1,6 +1,8 @@
 """The card a run writes is a valid one, tells what was measured, and holds no path; the upload gets five files."""
 
+import itertools
 import json
+import tomllib
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,8 +27,7 @@ from gift_peft import (
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.evaluation.metrics import METRICS
 from gift_peft.reports import model_card
-from gift_peft.reports.backbones import adapter_sizes, find_base
-from gift_peft.reports.card_metadata import base_license, is_local, portable_name
+from gift_peft.reports.model_card import base_license, find_backbone
 from gift_peft.training import loop, start, train, upload
 from gift_peft.training.arguments import GiftTrainingArguments
 
@@ -163,7 +164,7 @@ def test_push_is_checked_before_anything_is_loaded(base_dir, tree, tmp_path, mon
     def never(*args):
         raise AssertionError("training had begun")
 
-    monkeypatch.setattr(loop, "Run", never)
+    monkeypatch.setattr(loop, "load_base", never)
     monkeypatch.setattr(huggingface_hub, "get_token", lambda: None)
     with pytest.raises(ValueError, match="push_to_hub: no token; run `hf auth login` or set HF_TOKEN"):
         train(GiftTrainingArguments("some/base", str(tree), str(tmp_path / "out"), push_to_hub=True))
@@ -173,19 +174,6 @@ def test_push_is_checked_before_anything_is_loaded(base_dir, tree, tmp_path, mon
     with pytest.raises(ValueError, match=r"push_to_hub: .*'a/b/c'.*hub_model_id"):
         train(GiftTrainingArguments("some/base", "d", str(tmp_path / "out"), push_to_hub=True, hub_model_id="a/b/c"))
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "local"),
-    [("owner/model", False), ("model", False), ("./base", True), ("/a/b", True), ("a/b/c", True), ("~/base", True)],
-)
-def test_hub_ids_and_paths(name, local, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert is_local(name) is local
-    (tmp_path / "model").mkdir()
-    assert is_local("model")
-    assert portable_name("owner/model") == "owner/model"
-    assert portable_name(str(tmp_path / "model")) == "model"
 
 
 # ---- evaluations, backbones, data sets ----
@@ -224,6 +212,20 @@ def test_what_got_worse_stands_under_limits():
     assert "Other RMSE on the validation groups got worse, by 20.0 %" in limits and "ToM RMSE" not in limits
     report = report_of(random_rows([2, 3]), collapse={"target_mean_ratio": 0.1, "spread_ratio": 1.0, "alarm": True})
     assert "Collapse alarm on GIFT-I (proxy)" in model_card.model_card(asdict(args), record, [report])
+
+
+@pytest.mark.parametrize("name", ["facebook/VGGT-1B", "depth-anything/Depth-Anything-V2-Small-hf", "base", "a/b/c"])
+@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("reports", [[], [random_rows([2, 3])]], ids=["run", "evaluation"])
+def test_nothing_of_the_template_is_left(name, trained, reports):
+    args = GiftTrainingArguments(name, "someone/gift-i", "out")
+    metrics = {"base": ROW, "adapter": ROW | {"val_other_rmse": 0.3}}
+    record = upload.run_record(args, **RECORD, metrics=metrics, dataset_fingerprint="abc-1") if trained else None
+    text = model_card.model_card(asdict(args), record, [report_of(rows) for rows in reports])
+    assert not any(mark in text for mark in ("{{", "}}", "{%", "%}", "{#", "None", "Undefined", "\n\n\n"))
+    assert text.endswith(".\n") and not any(line.startswith(" |") for line in text.splitlines())
+    for before, after in itertools.pairwise(text.splitlines()):  # headings and tables need an empty line before them
+        assert not (after.startswith(("## ", "|---")) and before and not before.startswith("|")), (before, after)
 
 
 CARDS = {
@@ -275,15 +277,15 @@ def depth_anything_v2_large():
 )
 @pytest.mark.parametrize("head", ["full", "lora", "none"])
 def test_sizes_on_the_card_are_those_of_the_adapter(name, build, head):
-    base = find_base(name)
+    backbone = find_backbone(name)
     with torch.device("meta"):
         model = build()
-        assert sum(weight.numel() for weight in model.parameters()) == base.parameters
+        assert sum(weight.numel() for weight in model.parameters()) == backbone.parameters
         model = get_gift_model(model, rank=4, head=head)
     trained = [(name, weight.numel()) for name, weight in model.named_parameters() if weight.requires_grad]
     lora = sum(count for name, count in trained if "lora_" in name)
-    assert adapter_sizes(base, 4)[head] == (lora, sum(count for _, count in trained) - lora)
-    assert model.config.model_type == base.model_type
+    assert backbone.adapter_sizes(4)[head] == (lora, sum(count for _, count in trained) - lora)
+    assert model.config.model_type == backbone.model_type
 
 
 def test_a_trained_folder_is_not_taken_for_the_backbone_it_is_named_after(base_dir, tree, tmp_path, monkeypatch):
@@ -307,3 +309,10 @@ def test_the_dataset_card_is_valid(tmp_path):
         assert data.task_categories == ["depth-estimation"] and data.license and data.pretty_name
         assert data.to_dict()["configs"][0]["data_files"]
     assert DatasetCard.load(folder / "README.md").data.pretty_name == "My: mirrors"
+
+
+def test_the_templates_are_part_of_the_wheel():
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    folder = ROOT / "src" / "gift_peft" / "reports"
+    packed = {path for pattern in patterns["gift_peft.reports"] for path in folder.glob(pattern)}
+    assert len(packed) == 5 and packed == {path for path in folder.rglob("*.*") if path.suffix in (".md", ".html")}

@@ -18,7 +18,7 @@ from gift_peft import cli
 from gift_peft.dataset.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.group_step import GroupStep
-from gift_peft.training import checkpoints, loop, train, validation
+from gift_peft.training import checkpoints, loop, progress, train, validation
 
 
 @pytest.fixture
@@ -315,14 +315,14 @@ def test_leftovers_are_a_runs_own(tmp_path):
 
 
 def test_the_command_to_go_on_survives_a_space(tmp_path):
-    text = loop._how_to_resume(tmp_path / "my run", 3)
+    text = progress.how_to_resume(tmp_path / "my run", 3)
     assert f"--config '{tmp_path}/my run/config.yaml' --resume" in text
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["torchrun", "accelerate"])
 def test_documented_launch_lines(launcher, base_dir, tree, tmp_path):
-    """The lines of `gift_peft.training`'s docstring, on CPUs."""
+    """The lines of docs/several-gpus.md, on CPUs."""
     lines = {
         "torchrun": [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"],
         "accelerate": ["accelerate", "launch", "--multi_gpu", "--num_processes=2", "--main_process_port=0"],

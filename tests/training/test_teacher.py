@@ -145,7 +145,7 @@ def test_finished_groups_are_kept(raw_tree, base_dir, monkeypatch):
     lost.unlink()
     asked = []
     predict = teacher._predict_row
-    monkeypatch.setattr(teacher, "_predict_row", lambda *args: asked.append(args[1]["group_id"]) or predict(*args))
+    monkeypatch.setattr(teacher, "_predict_row", lambda *args: asked.append(args[1].group_id) or predict(*args))
     make_proxies(base_dir, raw_tree, size=SIZE)
     assert asked == ["scene_1"] and files(folder) == before
     assert all(path.stat().st_mtime_ns == time for path, time in times.items() if path != lost)

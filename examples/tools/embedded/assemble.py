@@ -2,6 +2,7 @@
 
     python examples/tools/embedded/assemble.py --groups renders/groups --model renders/model/base
 
+The groups become parquet shards, as `gift-peft export` writes them.
 Training groups go without depth and without their treated reference: the demo must not be able to look at them.
 `--complete` writes them with both, to measure how well the base knows the treated surfaces and what the groups teach.
 """
@@ -9,8 +10,10 @@ Training groups go without depth and without their treated reference: the demo m
 import argparse
 import json
 import shutil
+import tempfile
 from pathlib import Path
 
+from gift_peft.dataset.export import export_parquet
 from gift_peft.dataset.writer import write_gift_i
 
 DEMO = Path(__file__).resolve().parents[3] / "src" / "gift_peft" / "demo"
@@ -44,15 +47,17 @@ def main():
     parser.add_argument("--out", type=Path, default=DEMO)
     parser.add_argument("--complete", action="store_true", help="keep depth and reference of the training groups too")
     args = parser.parse_args()
-    for split in ("train", "validation"):
-        complete = args.complete or split == "validation"
-        write_gift_i(
-            read_groups(args.groups, split, complete),
-            args.out / "gift-i",
-            license="apache-2.0",
-            pretty_name="mini GIFT-I",
-            description=DESCRIPTION,
-        )
+    with tempfile.TemporaryDirectory() as loose:
+        for split in ("train", "validation"):
+            write_gift_i(
+                read_groups(args.groups, split, args.complete or split == "validation"),
+                loose,
+                license="apache-2.0",
+                pretty_name="mini GIFT-I",
+                description=DESCRIPTION,
+            )
+        shutil.rmtree(args.out / "gift-i", ignore_errors=True)
+        export_parquet(loose, args.out / "gift-i")
     shutil.copytree(args.model, args.out / "base", copy_function=shutil.copyfile, dirs_exist_ok=True)
     size = sum(path.stat().st_size for name in ("gift-i", "base") for path in (args.out / name).rglob("*.*"))
     print(f"{args.out}: {size / 1e6:.1f} MB")

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.demo.run import KINDS
 from gift_peft.reports.report import run_report
 
@@ -28,9 +29,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("demo", type=Path, help="folder of a demo that ended")
     demo = parser.parse_args().demo
-    groups = [min((demo / "gift-i" / "validation").glob(f"{kind}_*")) for kind in KINDS]
-    pictures = [min((group / "images").iterdir()) for group in groups]
-    folder = run_report([demo], card=CARDS / "demo_adapter.md", zero_shot=pictures)
+    rows = load_gift_i(demo / "gift-i", "validation")
+    names = rows["group_id"][:]
+    with tempfile.TemporaryDirectory() as place:
+        pictures = [Path(place, f"{kind}.png") for kind in KINDS]
+        for kind, picture in zip(KINDS, pictures, strict=True):
+            first = min(name for name in names if name.startswith(kind))
+            rows[names.index(first)]["images"][0].save(picture)
+        folder = run_report([demo], card=CARDS / "demo_adapter.md", zero_shot=pictures)
     reduce(demo / "before_after.png", CARDS / "demo_before_after.png")
     for name, target in FIGURES.items():
         reduce(folder / f"{name}.png", CARDS / f"demo_{target}.png")

@@ -6,8 +6,10 @@ The folder is whole or absent. For Depth Anything it loads with peft and transfo
 from __future__ import annotations
 
 import copy
+import functools
 import json
 import math
+import platform
 import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -18,7 +20,7 @@ from peft import LoraConfig, PeftConfig, PeftModel
 from peft.tuners.lora import LoraLayer
 
 from gift_peft.adapters.scale import active_lora, active_saved_modules
-from gift_peft.files import jsonable, reason, whole_folder
+from gift_peft.files import is_hub_id, jsonable, reason, whole_folder
 from gift_peft.rules import KINDS
 
 ADAPTER_CONFIG = "adapter_config.json"
@@ -87,8 +89,8 @@ def _base_name(model: PeftModel) -> str | None:
 
 
 def _hub_name(base: str | None, card: str | None) -> str | None:
-    """`base` if it may stand in a card: not a path of this machine."""
-    if base is None or not Path(base).exists():
+    """`base` if it may stand in a card: a hub id, not a path of this machine."""
+    if base is None or is_hub_id(base):
         return base
     warnings.warn(
         f"the base is the local folder {base}: others cannot load this adapter by its base's name; "
@@ -122,12 +124,14 @@ def processor_at_size(processor: Any, size: tuple[int, int] | None) -> Any:
 
 
 def _gift_json(gift: Mapping[str, Any] | None, size: tuple[int, int] | None) -> dict[str, Any]:
-    packages = ("gift-peft", "torch", "transformers", "peft", "accelerate")
-    return {
-        "versions": {name: version(name) for name in packages},
-        "size": size,
-        **(gift or {}),
-    }
+    return {"versions": versions(), "size": size, **(gift or {})}
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """Of what an adapter was made with: this package, those it uses, and Python."""
+    packages = ("gift-peft", "torch", "transformers", "peft", "accelerate", "datasets")
+    return {name: version(name) for name in packages} | {"python": platform.python_version()}
 
 
 def _minimal_card(hub_base: str | None) -> str:

@@ -1,4 +1,4 @@
-"""Other layouts of the same thing: capture folders with RGB, mask and proxy files, or lists of their paths.
+"""Captures in other folders than the raw tree's: one folder each with RGB and mask files, or lists of their paths.
 
 The paper describes its release only as capture folders below a configurable root, with relative paths (supplement A,
 "Mask processing and quality control"). A layout file says where the parts lie, so nothing has to be renamed:
@@ -8,15 +8,14 @@ root: gift-i                  # optional, below RAW
 splits: {train: train, validation: val}      # folder of each split, below the root
 images: rgb/*.png             # below a capture folder, which is any folder where this finds something
 mask: mask/{stem}.png         # {stem}: the image's name without its suffix
-proxy: depth/{stem}.npy       # optional; if it is named, every image needs one
 reference: treated/*.png      # optional
 ```
 
-or, in place of the last five, lists of relative paths, one image a line, comma- or space-separated:
+or, in place of the last four, lists of relative paths, one image a line, comma- or space-separated:
 
 ```yaml
 lists: {train: train.txt, validation: val.csv}
-columns: [image, mask, proxy]                # and reference, the same for all lines of a capture
+columns: [image, mask, reference]            # reference is optional, the same for all lines of a capture
 ```
 
 Every path is relative and stays below RAW; anything else is refused before a file is opened.
@@ -26,16 +25,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-import numpy as np
-import yaml
-from PIL import Image
-
 from gift_peft.captures.masks import MaskSource
 from gift_peft.captures.tree import Capture
-from gift_peft.images import is_image_file, natural_key
+from gift_peft.files import read_yaml
+from gift_peft.images import natural_key, sort_pictures
 from gift_peft.rules import SPLITS
 
-COLUMNS = ("image", "mask", "proxy", "reference")
+COLUMNS = ("image", "mask", "reference")
 
 
 @dataclass(frozen=True)
@@ -46,7 +42,6 @@ class Layout:
     splits: dict[str, str] = field(default_factory=lambda: {"train": "train", "validation": "validation"})
     images: str = "rgb/*"
     mask: str = "mask/{stem}.png"
-    proxy: str | None = None
     reference: str | None = None
     lists: dict[str, str] = field(default_factory=dict)
     columns: tuple[str, ...] = ("image", "mask")
@@ -71,28 +66,24 @@ class Layout:
 
     def read(self, folder: Path, split: str, raw: Path) -> Capture:
         """One capture folder; FileNotFoundError or ValueError naming the file that is missing."""
-        base = _below(raw, self.root, "root")
         images = _pictures(folder, self.images)
         references = _pictures(folder, self.reference) if self.reference else []
         if len(references) > 1:
             raise ValueError(f"{folder}: two references, {' and '.join(path.name for path in references[:2])}")
-        parts = {
-            name: [_present(folder, template.replace("{stem}", path.stem), raw) for path in images]
-            for name, template in (("mask", self.mask), ("proxy", self.proxy))
-            if template
-        }
-        start = _below(base, self.splits[split], "splits")
-        group_id = folder.relative_to(start).as_posix().replace("/", "__")
+        masks = [_present(folder, self.mask.replace("{stem}", path.stem), raw) for path in images]
         return Capture(
             folder,
-            folder.name if group_id == "." else group_id,
+            self.group_id(folder, split, raw),
             split,
             [_inside(path, raw) for path in images],
-            [MaskSource(path, "png") for path in parts["mask"]],
+            [MaskSource(path, "png") for path in masks],
             _inside(references[0], raw) if references else None,
-            {},
-            parts.get("proxy", []),
         )
+
+    def group_id(self, folder: Path, split: str, raw: Path) -> str:
+        """The capture folder's path below its split's folder, with __ for the separators."""
+        start = raw / self.root / self.splits[split]
+        return folder.name if folder == start else folder.relative_to(start).as_posix().replace("/", "__")
 
     def _from_list(self, base: Path, split: str, name: str) -> Iterator[Capture]:
         path = _below(base, name, f"lists, {split}")
@@ -129,24 +120,17 @@ class Layout:
                 [files["image"] for files in rows],
                 [MaskSource(files["mask"], "png") for files in rows],
                 next(iter(references), None),
-                {},
-                [files["proxy"] for files in rows if "proxy" in files],
             )
 
 
 def read_layout(path: str | Path) -> Layout:
     """The layout file; FileNotFoundError or ValueError naming it and the key."""
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"layout: no such file: {path}")
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"layout {path}: not valid YAML ({' '.join(str(error).split())})") from None
+    values = read_yaml(path, f"layout {path}")
     known = Layout.__dataclass_fields__
-    if not isinstance(values, dict) or not values.keys() <= known.keys():
-        raise ValueError(f"layout {path}: it may have the keys {', '.join(known)} and no others")
     for key, value in values.items():
+        if key not in known:
+            raise ValueError(f"layout {path}: unknown key {key!r}; it may have the keys {', '.join(known)}")
         if key in ("splits", "lists"):
             right = isinstance(value, dict) and set(value) <= set(SPLITS) and all(map(_is_text, value.values()))
         elif key == "columns":
@@ -155,7 +139,7 @@ def read_layout(path: str | Path) -> Layout:
             right = _is_text(value)
         if not right:
             raise ValueError(f"layout {path}: {key}: {value!r} is not what belongs there")
-    for key in ("images", "mask", "proxy", "reference"):
+    for key in ("images", "mask", "reference"):
         if key in values:
             _check_relative(values[key], f"layout {path}, {key}")
             if {"{", "}"} & set(values[key].replace("{stem}", "")):
@@ -163,17 +147,6 @@ def read_layout(path: str | Path) -> Layout:
     if "columns" in values:
         values["columns"] = tuple(values["columns"])
     return Layout(**values)
-
-
-def read_proxy(path: Path) -> np.ndarray:
-    """(h, w) float32 of a .npy file or a 16-bit PNG; ValueError naming it for anything else, or values not finite."""
-    try:
-        proxy = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.asarray(Image.open(path))
-    except (ValueError, EOFError, SyntaxError) as error:
-        raise ValueError(f"{path}: not a readable proxy ({error})") from None
-    if proxy.ndim != 2 or proxy.dtype.kind not in "fiu" or not np.isfinite(proxy).all():
-        raise ValueError(f"{path}: a proxy is (height, width) finite numbers, got {proxy.shape} {proxy.dtype}")
-    return proxy.astype(np.float32)
 
 
 def _is_text(value) -> bool:
@@ -210,7 +183,7 @@ def _present(folder: Path, text: str, raw: Path) -> Path:
 
 
 def _pictures(folder: Path, pattern: str) -> list[Path]:
-    return sorted(filter(is_image_file, folder.glob(pattern)), key=lambda path: natural_key(path.name))
+    return sort_pictures(folder.glob(pattern))
 
 
 def _common_folder(paths: list[PurePosixPath]) -> str:

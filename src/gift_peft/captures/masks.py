@@ -3,7 +3,7 @@
 `find_mask` looks, in this order, for: `masks/<stem>.png` or `<stem>_mask.png`; labelme's `<stem>.json`; CVAT's
 `SegmentationClass/<stem>.png` (colours named by `labelmap.txt`); and JSON exports that hold many images, COCO (CVAT,
 Label Studio; polygons or run lengths) and Label Studio's own, in the group's folder, its `annotations/` or `masks/`,
-or in a folder above it up to the root. The first found counts. Masks follow the rules of `preprocess.to_mask`; where
+or in a folder above it up to the root. The first found counts. Masks follow the rules of `images.to_mask`; where
 an export knows several labels, `mask_class` names the target's.
 """
 

@@ -19,7 +19,7 @@ from PIL import Image
 from gift_peft.captures.masks import MaskSource, find_mask, is_mask_file
 from gift_peft.files import read_yaml
 from gift_peft.images import image_digest, is_image_file, natural_key, read_image
-from gift_peft.rules import SPLITS, SURFACES, check_count, check_group
+from gift_peft.rules import SPLITS, SURFACES, GroupPictures, check_count
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +39,6 @@ class Capture:
         masks (`list[MaskSource | None]`): one per observation; None where there is none.
         reference (`Path`, *optional*): the treated reference.
         facts (`dict`): of `group.yaml`.
-        proxies (`list[Path]`): stored predictions of the observations that come with the images (`layout.py`), or [].
     """
 
     folder: Path
@@ -49,7 +48,6 @@ class Capture:
     masks: list[MaskSource | None]
     reference: Path | None = None
     facts: dict = field(default_factory=dict)
-    proxies: list[Path] = field(default_factory=list)
 
     def name(self, path: Path) -> str:
         """How an image is called in the dataset: its path inside the group's folder."""
@@ -168,15 +166,11 @@ def decode_capture(capture: Capture) -> Decoded:
     reference = None if capture.reference is None else read_image(capture.reference)
     names = [capture.name(capture.images[index]) for index in kept]
     check_count(capture.group_id, len(kept), capture.split, reference is not None)
-    known = all(mask is not None for mask in masks)
-    check_group(
-        capture.group_id,
-        names,
-        images,
-        masks if known else (),
-        reference=reference,
-        train=known and capture.split == "train",
-    )
+    blank = np.zeros(images[0].size[::-1], bool)  # where the mask is still to be proposed
+    drawn = [blank if mask is None else mask for mask in masks]
+    pictures = GroupPictures(capture.group_id, names, images, drawn, reference=reference)
+    if capture.split == "train" and all(mask is not None for mask in masks):
+        pictures.check_target()
     return Decoded(kept, images, masks, reference, duplicates)
 
 
@@ -207,7 +201,7 @@ def raw_example(folder: Path, split: str, root: Path) -> dict:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    """Also links that lead nowhere, so that they are complained about and not passed over."""
+    """In natural order, with links that lead nowhere, so that reading those is an error that names them."""
     if not folder.is_dir():
         return []
     folders = (
@@ -249,7 +243,7 @@ def _is_reference(path: Path) -> bool:
 
 
 def _has_reference(folder: Path) -> bool:
-    """Whether a group has one; what cannot be listed is complained about when it is read."""
+    """Whether a group has one; a folder that cannot be listed is an error when the group is read, not here."""
     try:
         return any(_is_reference(path) for path in _pictures(folder))
     except (OSError, ValueError):

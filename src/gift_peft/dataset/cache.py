@@ -19,10 +19,12 @@ import safetensors
 import safetensors.numpy
 import safetensors.torch
 
-from gift_peft.dataset.proxies import METADATA, row_digests
-from gift_peft.dataset.tensors import Group, resize_row, to_group
+from gift_peft.dataset.proxies import METADATA, picture_digests
+from gift_peft.dataset.rows import FORMAT_TYPE, RowRules
+from gift_peft.dataset.tensors import Group, resize_pictures, to_group
 from gift_peft.files import write_whole
 from gift_peft.models.pixels import pixel_settings
+from gift_peft.rules import SURFACES
 
 FORMAT = "gift-peft group 1"
 PICTURES = ("images", "masks", "valids")
@@ -43,47 +45,47 @@ class GroupCache:
     Args:
         dataset: rows as `load_gift_i` gives them, with or without proxies (which stay in their own files).
         processor, size: as for `collate_group`.
-        folder: of the entries; None keeps nothing. One that cannot be written is told once and then not used.
+        folder: of the entries; None keeps nothing. If it cannot be written, one warning says so and nothing is kept.
     """
 
     def __init__(self, dataset: datasets.Dataset, processor, size: tuple[int, int], folder: Path | None) -> None:
-        self.dataset = dataset
         self.processor = processor
         self.size = size
         self.folder = folder
+        rules = dataset.format["format_kwargs"].get("rules") or RowRules()
+        self._train, self._proxies = rules.train, rules.proxies
+        self._groups = dataset.with_format(FORMAT_TYPE, rules=RowRules(rules.train, parsed=True))
         self._stored = dataset.with_format("arrow")
-        self._rules = dataset.format["format_kwargs"].get("rules")
         self._checked: dict[int, Path] = {}  # the entries that were found whole in this run
 
     def read(self, index: int) -> Group:
-        """The group of one row, without its depths. Raises as reading the row and `collate_group` do."""
+        """The group of one row, without its `pictures`. Raises as reading the row and `collate_group` do."""
         path = self._checked.get(index) or self._path(index)
         found = None if path is None else self._load(path, check=index not in self._checked)
         if found is None:
-            row = self.dataset[index]
-            arrays = resize_row(row, self.processor, self.size)
+            pictures = self._groups[index]
+            arrays, digests = resize_pictures(pictures, self.processor, self.size), picture_digests(pictures)
             if path is not None:
-                self._write(path, arrays, row_digests(row))
+                self._write(path, arrays, digests)
         else:
             self._checked[index] = path
             arrays, digests = found
-            row = self._facts(index)
-            if self._rules is not None and self._rules.proxies is not None:
-                row["proxies"], row["reference_proxy"] = self._rules.proxies.read(row, digests)
-        return to_group(row, arrays, self.processor, self.size)
+        group_id, names, surface = self._facts(index)
+        proxies = (None, None) if self._proxies is None else self._proxies.read(group_id, names, digests)
+        return to_group(group_id, names, surface, arrays, proxies, self.processor, self.size)
 
-    def _facts(self, index: int) -> dict:
-        """A row without its pictures."""
+    def _facts(self, index: int) -> tuple[str, list[str], str | None]:
+        """(group id, image names, surface) of a row, whose pictures stay as they are stored."""
         table = self._stored[index]
-        return {name: table[name][0].as_py() for name in ("group_id", "surface", "image_names")}
+        group_id, names, surface = (table[name][0].as_py() for name in ("group_id", "image_names", "surface"))
+        return group_id, names, None if surface is None else SURFACES[surface]
 
     def _path(self, index: int) -> Path | None:
         """Where a row's entry is or will be; None if nothing can be kept (no folder, pictures behind URLs)."""
         if self.folder is None:
             return None
-        train = bool(self._rules and self._rules.train)  # asks more of a row than an evaluation does
         filter_ = [PIL.__version__, pixel_settings(self.processor)["resample"]]
-        settings = [FORMAT, *self.size, *filter_, train]
+        settings = [FORMAT, *self.size, *filter_, self._train]  # which asks more of a row than an evaluation does
         digest = hashlib.blake2b(json.dumps(settings).encode(), digest_size=20)
         row = self._stored[index]
         for column in (*PICTURES, "reference"):

@@ -7,7 +7,6 @@ streaming. The folder goes to the Hub with `hf upload NAME DST . --repo-type dat
 """
 
 import hashlib
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,9 +21,16 @@ from tqdm import tqdm
 
 from gift_peft.dataset.gift_i import FEATURES, gift_i_splits, load_gift_i
 from gift_peft.dataset.writer import CARD
+from gift_peft.files import whole_folder
 
-# The pictures are compressed already; chunking by content lets a changed dataset upload only what changed.
-OPTIONS = {"compression": "none", "use_content_defined_chunking": True, "write_page_index": True}
+# The pictures are compressed already; statistics of them would be whole small pictures once more, several times;
+# chunking by content lets a changed dataset upload only what changed.
+OPTIONS = {
+    "compression": "none",
+    "write_statistics": ["group_id"],
+    "use_content_defined_chunking": True,
+    "write_page_index": True,
+}
 EMPTY_CARD = CARD.format(
     license="",
     pretty_name="GIFT-I",
@@ -61,20 +67,13 @@ def export_parquet(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} exists and is not an empty folder; delete it or give another")
     card = _source_card(source, license)
-    partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of an export that was killed
-    try:
+    with whole_folder(folder) as place:
         splits = datasets.SplitDict()
         for split in gift_i_splits(source):
             rows = load_gift_i(source, split)
-            content = _write_split(rows, split, partial / "data", limit)
+            content = _write_split(rows, split, place / "data", limit)
             splits.add(datasets.SplitInfo(split, num_bytes=content, num_examples=len(rows)))
-        _complete_card(card, splits, partial)
-        if folder.exists():
-            folder.rmdir()
-        partial.replace(folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        _complete_card(card, splits, place)
     return folder
 
 

@@ -26,8 +26,8 @@ from tqdm import tqdm
 from gift_peft.captures.tree import list_groups, raw_example
 from gift_peft.dataset.proxies import FORMAT, ProxyStore, default_proxies_dir
 from gift_peft.dataset.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
-from gift_peft.files import reason
-from gift_peft.images import image_digest, natural_key, to_mask
+from gift_peft.files import is_hub_id, reason
+from gift_peft.images import image_digest, natural_key
 from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
 
@@ -218,7 +218,7 @@ def _unreadable(path: str | Path, error: BaseException) -> ValueError:
 
 
 def _load_from_hub(repository: str, split: str, revision: str | None) -> datasets.Dataset:
-    if not re.fullmatch(r"[\w.-]+(/[\w.-]+)?", repository) or Path(repository).exists():
+    if not is_hub_id(repository):
         raise FileNotFoundError(f"dataset {repository}: no such folder")
     try:
         return datasets.load_dataset(repository, split=split, features=FEATURES, revision=revision)
@@ -331,16 +331,16 @@ def dataset_fingerprint(dataset: datasets.Dataset) -> str:
 
     The same for raw tree, prepared folder and parquet of the same groups, and for any order of the groups.
     """
-    groups = []
-    rows = dataset.with_format(FORMAT_TYPE, rules=RowRules())
-    for row in tqdm(rows, desc="reading the dataset", unit="group", delay=2):
-        digest = hashlib.sha256(row["group_id"].encode())
-        for name, image, mask in zip(row["image_names"], row["images"], row["masks"], strict=True):
+    digests = []
+    groups = dataset.with_format(FORMAT_TYPE, rules=RowRules(parsed=True))
+    for group in tqdm(groups, desc="reading the dataset", unit="group", delay=2):
+        digest = hashlib.sha256(group.group_id.encode())
+        for name, image, mask in zip(group.names, group.images, group.masks, strict=True):
             digest.update(f"\n{name} {image_digest(image)} ".encode())
-            digest.update(np.packbits(to_mask(mask, f"group {row['group_id']}, image {name}: its mask")).tobytes())
-        for valid in row["valids"]:
-            digest.update(np.packbits(to_mask(valid, f"group {row['group_id']}: a valid mask")).tobytes())
-        if row["reference"] is not None:
-            digest.update(image_digest(row["reference"]).encode())
-        groups.append(digest.hexdigest())
-    return hashlib.sha256("\n".join(sorted(groups)).encode()).hexdigest()[:32]
+            digest.update(np.packbits(mask).tobytes())
+        for valid in group.valids:
+            digest.update(np.packbits(valid).tobytes())
+        if group.reference is not None:
+            digest.update(image_digest(group.reference).encode())
+        digests.append(digest.hexdigest())
+    return hashlib.sha256("\n".join(sorted(digests)).encode()).hexdigest()[:32]

@@ -1,7 +1,7 @@
 """The groups of an epoch, in its order, decoded and resized ahead of the step that needs them.
 
 An epoch's order is a permutation of (seed, epoch) alone, so a resumed run skips what it has done for free. A group is
-decoded and resized once (`data/cache.py`); threads prepare the next ones (Pillow, NumPy and PyTorch release the
+decoded and resized once (`cache.py`); threads prepare the next ones (Pillow, NumPy and PyTorch release the
 interpreter lock), so that the step does not wait.
 """
 

@@ -19,6 +19,7 @@ import safetensors
 
 from gift_peft.files import reason, write_whole
 from gift_peft.images import image_digest
+from gift_peft.rules import GroupPictures
 
 if TYPE_CHECKING:
     import torch
@@ -57,7 +58,7 @@ def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: to
 
 
 def make_header(teacher: str, revision: str, size: tuple[int, int], settings: dict) -> dict:
-    """The part of a file's header that all groups share; `row_digests` is the rest."""
+    """The part of a file's header that all groups share; `picture_digests` is the rest."""
     return {
         "format": FORMAT,
         "teacher": teacher,
@@ -67,12 +68,11 @@ def make_header(teacher: str, revision: str, size: tuple[int, int], settings: di
     }
 
 
-def row_digests(row: dict) -> dict:
+def picture_digests(group: GroupPictures) -> dict:
     """The part of a header that pins one group's pixels: `images`, in order, and `reference` (None without one)."""
-    reference = row["reference"]
     return {
-        "images": [image_digest(image) for image in row["images"]],
-        "reference": None if reference is None else image_digest(reference),
+        "images": [image_digest(image) for image in group.images],
+        "reference": None if group.reference is None else image_digest(group.reference),
     }
 
 
@@ -121,35 +121,28 @@ class ProxyStore:
     expected: dict
     command: str
 
-    def read(self, row: dict, digests: dict | None = None) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """(proxies (N, h, w), reference (h, w) or None), float32, of a decoded row, or one of known `row_digests`.
+    def read(self, group_id: str, names: Sequence[str], digests: dict) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """(proxies (N, h, w), reference (h, w) or None), float32, of a group with these `picture_digests`.
 
         Raises FileNotFoundError for a missing file and ValueError for a stale, damaged or NaN one, naming it and the
         command that makes it again.
         """
         import safetensors.torch
 
-        names = row["image_names"]
-        path = Path(self.folder) / f"{row['group_id']}.safetensors"
+        path = Path(self.folder) / f"{group_id}.safetensors"
         if not path.exists():
             raise FileNotFoundError(f"missing proxy {path}; make it with `{self.command}`")
-        header = read_header(path, self.command)
-        tensors = safetensors.torch.load_file(path)
-        if "proxies" not in tensors:
-            raise ValueError(
-                f"damaged proxy {path} (not a proxy file); make it again with `{self.command} --overwrite`"
-            )
-        if len(tensors["proxies"]) != len(header.get("images", tensors["proxies"])):
-            raise ValueError(
-                f"damaged proxy {path} (it holds {len(tensors['proxies'])} of {len(header['images'])} proxies); "
-                f"make it again with `{self.command} --overwrite`"
-            )
-        for name, proxy in [*zip(names, tensors["proxies"], strict=False), ("reference", tensors.get("reference"))]:
+        header, tensors = read_header(path, self.command), safetensors.torch.load_file(path)
+        proxies, reference = tensors.get("proxies"), tensors.get("reference")
+        again = f"make it again with `{self.command} --overwrite`"
+        if proxies is None:
+            raise ValueError(f"damaged proxy {path} (not a proxy file); {again}")
+        made = len(header.get("images", proxies))
+        if len(proxies) != made:
+            raise ValueError(f"damaged proxy {path} (it holds {len(proxies)} of {made} proxies); {again}")
+        for name, proxy in [*zip(names, proxies, strict=False), ("reference", reference)]:
             if proxy is not None and not proxy.isfinite().all():
-                raise ValueError(
-                    f"NaN or infinite values in proxy {path} ({name}); make it again with `{self.command} --overwrite`"
-                )
-        reason = difference(header, {**self.expected, **(digests or row_digests(row))}, names)
-        if reason:
-            raise ValueError(f"stale proxy {path}: {reason}; make it again with `{self.command} --overwrite`")
-        return tensors["proxies"], tensors.get("reference")
+                raise ValueError(f"NaN or infinite values in proxy {path} ({name}); {again}")
+        if changed := difference(header, {**self.expected, **digests}, names):
+            raise ValueError(f"stale proxy {path}: {changed}; {again}")
+        return proxies, reference

@@ -5,17 +5,19 @@ DataLoader workers), only the rows that are accessed are decoded, and a damaged 
 the decoding of the `Image` feature alone does not give.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
+import datasets
 import numpy as np
 import pyarrow as pa
 from datasets import formatting
 from datasets.formatting.formatting import Formatter
 from PIL import Image
 
-from gift_peft.dataset.proxies import ProxyStore
+from gift_peft.dataset.proxies import ProxyStore, picture_digests
 from gift_peft.images import open_image, to_mask, to_rgb
-from gift_peft.rules import check_group, label_items
+from gift_peft.rules import GroupPictures, parse_group
 
 FORMAT_TYPE = "gift_i"
 IMAGE_COLUMNS = ("images", "masks", "valids", "depths")
@@ -23,13 +25,23 @@ IMAGE_COLUMNS = ("images", "masks", "valids", "depths")
 
 @dataclass(frozen=True)
 class RowRules:
-    """`train` asks for a target in some mask; `proxies` attaches `proxies` and `reference_proxy`.
+    """How rows are read. Unpickling a dataset elsewhere imports this module, and with it the formatter.
 
-    A class of this module, so that unpickling a dataset in a fresh process imports and registers the formatter.
+    Args:
+        train (`bool`): some mask of a group must have a target.
+        proxies (`ProxyStore`, *optional*): adds `proxies` and `reference_proxy`.
+        parsed (`bool`): a row is a `GroupPictures` in place of a dict.
     """
 
     train: bool = False
     proxies: ProxyStore | None = None
+    parsed: bool = False
+
+
+def parsed(rows: Any) -> Any:
+    """Rows of `load_gift_i`, read as `GroupPictures` in place of dicts; any other rows as they are."""
+    rules = rows.format["format_kwargs"].get("rules") if isinstance(rows, datasets.Dataset) else None
+    return rows if rules is None else rows.with_format(FORMAT_TYPE, rules=replace(rules, parsed=True))
 
 
 class GiftIFormatter(Formatter):
@@ -39,7 +51,7 @@ class GiftIFormatter(Formatter):
         super().__init__(features=features, token_per_repo_id=token_per_repo_id)
         self.rules = rules
 
-    def format_row(self, pa_table: pa.Table) -> dict:
+    def format_row(self, pa_table: pa.Table) -> dict | GroupPictures:
         return self._row(self.python_arrow_extractor().extract_row(pa_table))
 
     def format_batch(self, pa_table: pa.Table) -> dict[str, list]:
@@ -49,7 +61,7 @@ class GiftIFormatter(Formatter):
     def format_column(self, pa_table: pa.Table) -> list:
         return self.format_batch(pa_table)[pa_table.column_names[0]]
 
-    def _row(self, stored: dict) -> dict:
+    def _row(self, stored: dict) -> dict | GroupPictures:
         pictures = {key: stored[key] for key in (*IMAGE_COLUMNS, "reference") if key in stored}
         row = {key: value for key, value in stored.items() if key not in pictures}
         row = self.python_features_decoder.decode_row(row) if row else row
@@ -60,9 +72,11 @@ class GiftIFormatter(Formatter):
             else:
                 row[key] = [self._picture(key, item, at) for item in value or []]
         if pictures.keys() == {*IMAGE_COLUMNS, "reference"} and {"group_id", "image_names"} <= row.keys():
-            self._check(row)
+            group = self._parse(row)
+            if self.rules.parsed:
+                return group
             if self.rules.proxies is not None:
-                row["proxies"], row["reference_proxy"] = self.rules.proxies.read(row)
+                row["proxies"], row["reference_proxy"] = group.proxies, group.reference_proxy
         return {key: row[key] for key in [*stored, *(key for key in row if key not in stored)]}
 
     def _picture(self, column: str, item: dict, at: str) -> Image.Image:
@@ -76,12 +90,14 @@ class GiftIFormatter(Formatter):
         # Other modes (palette, 16 bit) would change their values in a conversion to L: take the mask, write it as one.
         return image if image.mode == "L" else Image.fromarray(to_mask(image, name).astype(np.uint8) * 255)
 
-    def _check(self, row: dict) -> None:
-        group_id, names = row["group_id"], row["image_names"]
-        masks = [to_mask(*item) for item in label_items(group_id, names, "mask", row["masks"])]
-        valids = [to_mask(*item) for item in label_items(group_id, names, "valid mask", row["valids"], True)]
-        depths = [np.asarray(depth) for depth in row["depths"]]
-        check_group(group_id, names, row["images"], masks, valids, depths, row["reference"], train=self.rules.train)
+    def _parse(self, row: dict) -> GroupPictures:
+        group = parse_group(row)
+        if self.rules.train:
+            group.check_target()
+        if self.rules.proxies is None:
+            return group
+        proxies, reference = self.rules.proxies.read(group.group_id, group.names, picture_digests(group))
+        return replace(group, proxies=proxies, reference_proxy=reference)
 
 
 def _open(item: dict, fallback: str) -> tuple[Image.Image, str]:

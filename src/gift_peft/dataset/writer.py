@@ -6,7 +6,6 @@ a readable copy `groups.jsonl`, and a dataset card whose YAML names the files of
 
 import hashlib
 import json
-import os
 import re
 import shutil
 from collections.abc import Iterable
@@ -17,9 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from gift_peft.files import write_whole
+from gift_peft.files import whole_folder, write_whole
 from gift_peft.images import image_digest, open_image, to_mask, to_rgb
-from gift_peft.rules import SPLITS, SURFACES, check_group, check_group_id, label_items
+from gift_peft.rules import SPLITS, SURFACES, check_group_id, parse_group
 
 NAMES = pa.list_(pa.string())
 SCHEMA = pa.schema(
@@ -141,40 +140,27 @@ def write_group(group: dict, root: Path) -> dict:
     group_id, split = group["group_id"], group.get("split")
     if split not in SPLITS:
         raise ValueError(f"group {group_id}: split {split!r}; write train or validation")
-    folder = root / split
     check_group_id(group_id)
-    surface = group.get("surface")
+    surface, reference = group.get("surface"), group.get("reference")
     if surface is not None and surface not in SURFACES:
         raise ValueError(f"group {group_id}: surface {surface!r}; it is one of {', '.join(SURFACES)} or None")
     names = list(group.get("image_names") or _default_names(group["images"]))
-    images = [_rgb(*item) for item in label_items(group_id, names, "image", group["images"])]
-    masks = [_mask(*item) for item in label_items(group_id, names, "mask", group["masks"])]
-    valids = [_mask(*item) for item in label_items(group_id, names, "valid mask", group.get("valids"), True)]
-    depths = [_depth(*item) for item in label_items(group_id, names, "depth", group.get("depths"), True)]
-    reference = group.get("reference")
-    reference_image = None if reference is None else _rgb(reference, f"group {group_id}: the reference")
-    check_group(group_id, names, images, masks, valids, depths, reference_image, train=split == "train")
+    pictures = parse_group({**group, "image_names": names}, _rgb, _mask, _depth)
+    if split == "train":
+        pictures.check_target()
     least = 1 if split == "validation" and reference is not None else 2
-    if len({image_digest(image) for image in images}) < max(least, len(images)):
-        raise ValueError(f"group {group_id}: {len(images)} images; it takes at least {least}, all different")
+    if len({image_digest(image) for image in pictures.images}) < max(least, len(names)):
+        raise ValueError(f"group {group_id}: {len(names)} images; it takes at least {least}, all different")
 
-    partial = folder / f".{group_id}.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    files = {kind: [] for kind in ("images", "masks", "valids", "depths")}
     stems = [f"{index:02d}_{re.sub(r'[^A-Za-z0-9_.-]', '_', Path(name).stem)}" for index, name in enumerate(names)]
-    for kind, items in (("images", group["images"]), ("masks", masks), ("valids", valids), ("depths", depths)):
-        for stem, item in zip(stems, items, strict=False):
-            files[kind].append(f"{group_id}/{kind}/{_save(item, partial / kind / stem)}")
-    reference_file = None if reference is None else f"{group_id}/{_save(reference, partial / 'reference')}"
-    shutil.rmtree(folder / group_id, ignore_errors=True)
-    os.replace(partial, folder / group_id)
-    return {
-        "group_id": group_id,
-        "surface": surface,
-        "image_names": names,
-        **{f"{kind}_file_names": paths for kind, paths in files.items()},
-        "reference_file_name": reference_file,
-    }
+    parts = {"images": group["images"], **{kind: getattr(pictures, kind) for kind in ("masks", "valids", "depths")}}
+    row = {"group_id": group_id, "surface": surface, "image_names": names}
+    with whole_folder(root / split / group_id) as folder:
+        for kind, items in parts.items():
+            files = [_save(item, folder / kind / stem) for item, stem in zip(items, stems, strict=False)]
+            row[f"{kind}_file_names"] = [f"{group_id}/{kind}/{file}" for file in files]
+        file = None if reference is None else f"{group_id}/{_save(reference, folder / 'reference')}"
+    return row | {"reference_file_name": file}
 
 
 def _default_names(images: list) -> list[str]:
@@ -185,7 +171,7 @@ def _default_names(images: list) -> list[str]:
 
 
 def _rgb(source, name: str) -> Image.Image:
-    at = name if isinstance(source, Image.Image) else f"{source}"
+    at = name if isinstance(source, Image.Image) else str(source)
     return to_rgb(open_image(source, at), at)
 
 
@@ -193,8 +179,8 @@ def _mask(source, name: str) -> np.ndarray:
     if isinstance(source, np.ndarray):
         if source.ndim != 2 or source.dtype not in (bool, np.uint8):
             raise ValueError(f"{name}: a mask is (H, W) bool, got {source.shape} {source.dtype}")
-        return to_mask(Image.fromarray(source.astype(np.uint8) if source.dtype == bool else source), name)
-    at = name if isinstance(source, Image.Image) else f"{source}"
+        return source if source.dtype == bool else to_mask(Image.fromarray(source), name)
+    at = name if isinstance(source, Image.Image) else str(source)
     return to_mask(open_image(source, at), at)
 
 
@@ -233,7 +219,8 @@ def _write_metadata(path: Path, rows: Iterable[dict]) -> None:
 
 def _card(rows: dict[str, dict], license: str, pretty_name: str, description: str, content: str) -> str:
     present = [split for split in SPLITS if rows[split]]
-    counts = [f"{split}: {len(rows[split])} groups, {_count_images(rows[split])} images" for split in present]
+    images = {split: sum(len(row["image_names"]) for row in rows[split].values()) for split in present}
+    counts = [f"{split}: {len(rows[split])} groups, {images[split]} images" for split in present]
     return CARD.format(
         license=license,
         pretty_name=json.dumps(pretty_name),
@@ -243,7 +230,3 @@ def _card(rows: dict[str, dict], license: str, pretty_name: str, description: st
         counts="; ".join(counts) + ".",
         data_files="\n".join(f"  - split: {split}\n    path: {split}/**" for split in present),
     )
-
-
-def _count_images(rows: dict[str, dict]) -> int:
-    return sum(len(row["image_names"]) for row in rows.values())

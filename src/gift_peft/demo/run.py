@@ -13,10 +13,12 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.dataset.rows import parsed
+from gift_peft.demo.validation_page import validation_page
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.tables import markdown_table, text_table
-from gift_peft.files import write_whole
+from gift_peft.files import whole_folder, write_whole
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.figures import before_after
 from gift_peft.reports.model_card import run_length
@@ -43,8 +45,9 @@ def run_demo(
     """Trains, evaluates and writes `out`; returns the reports against the proxy and against true depth.
 
     Args:
-        out: gets `base/`, `gift-i/`, `adapter/` (naming the base by the path out/base), `report.md`,
-            `before_after.png`, `metrics.jsonl`, `evaluation-proxy/` and `evaluation-depth/`.
+        out: gets `base/`, `gift-i/` (parquet shards, proxies beside them), `adapter/` (naming the base by the path
+            out/base), `report.md`, `before_after.png`, `validation.html`, `metrics.jsonl`, `evaluation-proxy/` and
+            `evaluation-depth/`.
         overwrite_output_dir: delete the run that `out` holds.
         seed: of the LoRA initialisation and the order of the groups.
         extra: training arguments that win over the demo's, as on the command line (`--lambda_d=0`).
@@ -82,6 +85,7 @@ def run_demo(
         report.save(out / f"evaluation-{reference}")
         reports[reference] = report
     before_after(_panels(groups, reports["depth"], model), out / "before_after.png")
+    write_whole(out / "validation.html", validation_page(parsed(groups)))
     write_whole(out / "report.md", _markdown(reports, args))
     _print_summary(reports, out)
     return reports
@@ -92,12 +96,10 @@ def _copy_embedded(name: str, destination: Path) -> None:
     with as_file(files("gift_peft.demo") / name) as source:
         if not source.is_dir():
             raise FileNotFoundError(f"the installed package lacks gift_peft/demo/{name}; install it again")
-        temporary = destination.with_name(f".{destination.name}.{os.getpid()}")
-        shutil.copytree(source, temporary, dirs_exist_ok=True)
-    if (destination / "proxies").is_dir():
-        os.replace(destination / "proxies", temporary / "proxies")
-    shutil.rmtree(destination, ignore_errors=True)
-    os.replace(temporary, destination)
+        with whole_folder(destination) as place:
+            shutil.copytree(source, place, dirs_exist_ok=True)
+            if (destination / "proxies").is_dir():
+                os.replace(destination / "proxies", place / "proxies")
 
 
 def _scored(report: Report, kind: str) -> list[dict]:
@@ -110,8 +112,7 @@ def _panels(groups, report: Report, model: DepthModel) -> list:
     rows = {group_id: index for index, group_id in enumerate(groups.select_columns(["group_id"])["group_id"])}
     panels = []
     for kind, label in KINDS.items():
-        own = _scored(report, kind)
-        worst = max(own, key=lambda row: row["base"]["tom"]["rmse"])
+        worst = max(_scored(report, kind), key=lambda row: row["base"]["tom"]["rmse"])
         panels += group_panels(groups[rows[worst["group_id"]]], {worst["image"]: label}, model)
     return panels
 
@@ -140,7 +141,8 @@ These are results on rendered scenes; they show the method at work, not what a l
 
 ![RGB, true depth, base and adapted for a mirror, a pane and a glass object](before_after.png)
 
-For each kind of target the picture shows the observation on which the base errs most.
+For each kind of target the picture shows the observation on which the base errs most;
+[validation.html](validation.html) shows every validation group.
 
 ## Against true depth
 

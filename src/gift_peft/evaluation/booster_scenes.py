@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from gift_peft.files import reason
-from gift_peft.images import SINGLE_CHANNEL, is_image_file, natural_key, open_image, to_mask
+from gift_peft.images import SINGLE_CHANNEL, natural_key, open_image, sort_pictures, to_mask
 
 SUBSETS = ("balanced", "unbalanced")
 OCCLUSIONS = ("all", "noc")
@@ -197,8 +197,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _scene(folder: Path) -> BoosterScene:
     camera = folder / CAMERA
-    files = camera.iterdir() if camera.is_dir() else []
-    images = sorted(filter(is_image_file, files), key=lambda path: natural_key(path.name))
+    images = sort_pictures(camera.iterdir()) if camera.is_dir() else []
     if not images:
         raise FileNotFoundError(f"Booster scene {folder}: no images in {CAMERA}/")
     stems: dict[str, Path] = {}

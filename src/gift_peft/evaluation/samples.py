@@ -15,7 +15,7 @@ import torch
 from gift_peft.dataset.tensors import Group, collate_group
 from gift_peft.evaluation.booster_scenes import BoosterScene, GroundTruth
 from gift_peft.evaluation.stored_predictions import PredictionFolder
-from gift_peft.images import read_image, to_mask
+from gift_peft.images import read_image
 from gift_peft.losses import require_finite
 from gift_peft.models.loading import DepthModel
 
@@ -89,7 +89,7 @@ def gift_i_sample(
             )
     if consensus_too:
         maps["consensus"] = consensus(maps["base"], group.mask, group.valid)
-    known = _against_depth(row, group) if reference == "depth" else _against_proxy(group, model)
+    known = _against_depth(group) if reference == "depth" else _against_proxy(group, model)
     observations = [
         Observation(name, {model: depth[index] for model, depth in maps.items()}, *known[index])
         for index, name in enumerate(group.names)
@@ -120,17 +120,15 @@ def _against_proxy(group: Group, model: DepthModel) -> list[tuple]:
     return _on_network_grid(group, None if target is None else target.numpy())
 
 
-def _against_depth(row: Any, group: Group) -> list[tuple]:
+def _against_depth(group: Group) -> list[tuple]:
     """Per observation true depth, mask and valid mask on the depth's own grid, where the masks were drawn."""
-    if group.depths is None:
-        return _on_network_grid(group, None)
-    if isinstance(row, Group):
+    pictures = group.pictures
+    if pictures is None:
         raise ValueError('reference="depth" needs the rows of load_gift_i: a Group has no masks at the depth\'s size')
-    label = [f"group {group.group_id}, image {name}" for name in group.names]
-    masks = [to_mask(mask, f"{at}: its mask") for mask, at in zip(row["masks"], label, strict=True)]
-    valids = [to_mask(mask, f"{at}: its valid mask") for mask, at in zip(row.get("valids") or [], label, strict=False)]
-    depths = [depth.numpy() for depth in group.depths]
-    return list(zip(depths, masks, valids or [None] * len(masks), strict=True))
+    if not pictures.depths:
+        return _on_network_grid(group, None)
+    depths = [depth.astype(np.float32) for depth in pictures.depths]
+    return list(zip(depths, pictures.masks, pictures.valids or [None] * len(depths), strict=True))
 
 
 def _on_network_grid(group: Group, reference: np.ndarray | None) -> list[tuple]:

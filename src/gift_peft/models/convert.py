@@ -4,7 +4,6 @@ The folder has config, safetensors, image processor and the model's own code, so
 `trust_remote_code=True`. It appears when it is complete, or not at all.
 """
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +11,13 @@ from huggingface_hub.errors import StrictDataclassError
 from safetensors import SafetensorError
 from transformers import PreTrainedConfig, PreTrainedModel
 
-from gift_peft.files import whole_folder
+from gift_peft.files import is_hub_id, whole_folder
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
 from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil
 
 # What a hub id without a file means: facebook/VGGT-1B, JUGGHM/Metric3D.
 VGGT_FILE = "model.safetensors"
 METRIC3D_FILE = "metric_depth_vit_giant2_800k.pth"
-HUB_ID = re.compile(r"(?P<repo>[\w.-]+/[\w.-]+)(/(?P<file>[\w./-]+))?")
 
 
 def convert_vggt(source: str | Path, folder: str | Path, config: VggtConfig | str | Path | None = None) -> Path:
@@ -55,19 +53,20 @@ CONVERTERS = {"vggt": convert_vggt, "metric3d": convert_metric3d}
 def _fetch(source: str | Path, default: str, folder: str | Path) -> Path:
     """The local file of `source`, downloaded if it is on the hub; after a look at `folder`, which costs less."""
     _check_free(Path(folder))
-    path, match = Path(source), HUB_ID.fullmatch(str(source))
-    if path.exists() or match is None or (path.suffix in (".safetensors", ".pt", ".pth") and not match["file"]):
+    path, parts = Path(source), str(source).split("/")
+    repository, file = "/".join(parts[:2]), "/".join(parts[2:]) or default
+    a_file_here = len(parts) < 3 and path.suffix in (".safetensors", ".pt", ".pth")
+    if path.exists() or a_file_here or len(parts) < 2 or not parts[-1] or not is_hub_id(repository):
         return path  # from_official says if there is none
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import HfHubHTTPError
 
-    file = match["file"] or default
     try:
-        return Path(hf_hub_download(match["repo"], file))
+        return Path(hf_hub_download(repository, file))
     except (OSError, ValueError, HfHubHTTPError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise FileNotFoundError(
-            f"{source}: no such file, and {file} of {match['repo']} does not come from the hub ({reason})"
+            f"{source}: no such file, and {file} of {repository} does not come from the hub ({reason})"
         ) from None
 
 

@@ -5,7 +5,7 @@ import hashlib
 import re
 from pathlib import Path
 
-from gift_peft.files import reason
+from gift_peft.files import is_hub_id, reason
 
 
 def teacher_id(base: str | Path, revision: str | None = None) -> str:
@@ -19,13 +19,8 @@ def teacher_id(base: str | Path, revision: str | None = None) -> str:
 
 def check_base_name(base: str | Path) -> None:
     """Raise FileNotFoundError unless `base` is a folder or could be a hub id."""
-    from huggingface_hub.utils import validate_repo_id
-
-    if not Path(base).is_dir():
-        try:
-            validate_repo_id(str(base))
-        except ValueError:
-            raise FileNotFoundError(f"base model {base}: no such folder") from None
+    if not Path(base).is_dir() and not is_hub_id(base):
+        raise FileNotFoundError(f"base model {base}: no such folder")
 
 
 def teacher_revision(base: str | Path, revision: str | None = None) -> str:

@@ -1,397 +1,305 @@
-"""One group from photos to a checked, registered group on disk; `captures.py` runs this for every group of a tree."""
+"""One group from photos to a checked, registered group on disk, in four steps: decode, register, check, write.
+
+`prepare.py` runs this for every group of a tree. Each picture is a `Photo`: its pixels, its mask, the map that
+registers it, and its entry in the report.
+"""
 
 import os
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image
 
-from gift_peft.captures.foreign import read_proxy
 from gift_peft.captures.tree import Capture, check_masks, decode_capture
 from gift_peft.dataset.writer import write_group
-from gift_peft.prepare.job import Job, Outcome, capture_digest
+from gift_peft.prepare.entries import FrameEntry, GroupEntry, GroupQuality, ReferenceQuality, Remark
+from gift_peft.prepare.job import Job, Outcome, capture_digest, printable
 from gift_peft.prepare.matching import Frame
-from gift_peft.prepare.quality import Small, check_frames, check_group_change, pairwise_changes
-from gift_peft.prepare.registration import Registration, reason, register, valid_area, warp, warp_stored
+from gift_peft.prepare.quality import SmallFrame, check_frames, check_group_change, pairwise_changes
+from gift_peft.prepare.registration import Registration, register, valid_area, warp
+from gift_peft.prepare.settings import QualitySettings, RegistrationSettings
 from gift_peft.rules import check_count, check_group_id
 
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything
+# Remarks that count for a treated reference; inside the target it differs by design.
+ABOUT_REFERENCE = ("too_dark", "too_bright", "another_scene", "outside_change")
 
 
 class Rejection(Exception):
-    """Ends the work on a group; carries the reasons."""
+    """Ends the work on a group; carries the reason."""
 
-    def __init__(self, *reasons: dict):
-        super().__init__("; ".join(item["text"] for item in reasons))
-        self.reasons = list(reasons)
+    def __init__(self, code: str, text: str):
+        super().__init__(text)
+        self.reason = Remark(code, text)
+
+
+@dataclass
+class Photo:
+    """One picture of a group, an observation or the treated reference.
+
+    Args:
+        entry (`FrameEntry`): its part of the report, which says whether it is dropped or warped.
+        source (`Path`): its file, which is copied if the pixels stay as they are.
+        pixels (`np.ndarray`): (H, W, 3) uint8.
+        mask (`np.ndarray`, *optional*): (H, W) bool, as drawn or proposed.
+        matrix (`np.ndarray`, *optional*): (3, 3), to the target frame; None if registration dropped it.
+    """
+
+    entry: FrameEntry
+    source: Path
+    pixels: np.ndarray
+    mask: np.ndarray | None
+    matrix: np.ndarray | None = None
+
+    @property
+    def dropped(self) -> bool:
+        return self.entry.status == "dropped"
+
+    @property
+    def warped(self) -> bool:
+        return self.entry.status == "warped"
+
+    @property
+    def gray(self) -> np.ndarray:
+        return cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY)
+
+    @property
+    def picture(self) -> Path | Image.Image:
+        """What is written: the file as it is, or the warped pixels."""
+        return Image.fromarray(self.registered(self.pixels)) if self.warped else self.source
+
+    def decide(self, result: Registration) -> None:
+        entry, self.matrix = self.entry, result.matrix
+        entry.status, entry.reasons, entry.warnings = result.status, result.reasons, result.warnings
+        entry.registration = result.figures
+
+    def registered(self, array: np.ndarray) -> np.ndarray:
+        """The picture, its mask or another map of it as the target frame's camera sees it."""
+        return warp(array, self.matrix) if self.warped else array
+
+    @cached_property
+    def valid(self) -> np.ndarray:
+        """(H, W) bool: where it has pixels once it is registered. Ask for it after that."""
+        height, width = self.pixels.shape[:2]
+        return valid_area(self.matrix, (width, height)) if self.warped else np.ones((height, width), bool)
+
+    def small(self, mask: np.ndarray) -> SmallFrame:
+        """For comparisons; `mask` (H, W) bool is registered."""
+        return SmallFrame(cv2.cvtColor(self.registered(self.pixels), cv2.COLOR_RGB2GRAY), mask, self.valid)
 
 
 def prepare_group(job: Job) -> Outcome:
     """Read, register, check and stage one group. What is wrong with it ends in its entry, never in an exception."""
     cv2.setNumThreads(1)  # groups run side by side instead
-    digest = None
-    group = _Group(job)
+    entry = GroupEntry(printable(job.group_id), job.split, job.relative(job.folder))
+    digest = row = None
     try:
         check_group_id(job.group_id)
-        group.capture = job.read()
-        group.start()
-        digest = capture_digest(group.capture, job.settings)
-        if digest == job.known:
-            return Outcome(digest, group.entry, unchanged=True)
-        if None in group.capture.masks and not job.settings.propose_masks:
-            check_masks(group.capture)
-        group.decode()
-        row = group.prepare()
-        return Outcome(digest, _finite(group.entry), row)
+        capture = job.read()
+        list_frames(capture, job, entry)
+        digest = capture_digest(capture, job.settings)
+        if digest != job.known:
+            row = _make(capture, job, entry)
     except Rejection as rejection:
-        group.reject(rejection.reasons)
+        entry.reject(rejection.reason)
     except (OSError, ValueError, cv2.error, MemoryError, RecursionError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        group.reject([reason("unreadable", _printable(text.replace(f"{job.raw}{os.sep}", "")))])
+        entry.reject(Remark("unreadable", printable(text.replace(f"{job.raw}{os.sep}", ""))))
         digest = None  # it may be a passing trouble (permissions, memory): try again next time
-    return Outcome(digest, _finite(group.entry))
+    return Outcome(digest, entry.as_json(), row)
 
 
-class _Group:
-    """The work on one group, step by step; `entry` is its part of the report (`captures.py` lists the keys)."""
+def _make(capture: Capture, job: Job, entry: GroupEntry) -> dict:
+    """The staged group's metadata row."""
+    if not job.settings.propose_masks:
+        check_masks(capture)
+    photos, reference = decode(capture, entry)
+    entry.target_frame = photos[-1].entry.name
+    static = job.settings.static_rig or capture.facts.get("static_rig", False)
+    if any(photo.mask is None for photo in photos):
+        propose_masks(photos, reference, static, job, entry)
+    register_photos(photos, reference, static, job.settings.registration)
+    check(photos, reference, job, entry)
+    return write([photo for photo in photos if not photo.dropped], reference, entry.surface, job)
 
-    def __init__(self, job: Job):
-        self.job, self.settings = job, job.settings
-        self.capture: Capture | None = None
-        self.entry = {
-            "group_id": _printable(job.group_id),
-            "split": job.split,
-            "surface": None,
-            "notes": None,
-            "folder": self._relative(job.folder),
-            "status": "kept",
-            "reasons": [],
-            "warnings": [],
-            "size": None,
-            "target_frame": None,
-            "quality": {},
-            "proposal": None,
-            "frames": [],
-        }
 
-    def _relative(self, path: Path) -> str:
-        return _printable(path.relative_to(self.job.raw).as_posix())
+def list_frames(capture: Capture, job: Job, entry: GroupEntry) -> None:
+    """The group's facts and its pictures as the report lists them, before any is decoded."""
+    notes = capture.facts.get("notes")
+    entry.surface, entry.notes = capture.facts.get("surface"), None if notes is None else str(notes)
+    paths = [(path, "observation") for path in capture.images]
+    paths += [(capture.reference, "reference")] if capture.reference is not None else []
+    for path, role in paths:
+        name = capture.name(path) if path.is_relative_to(capture.folder) else path.name
+        entry.frames.append(FrameEntry(printable(name), role, job.relative(path)))
 
-    def reject(self, reasons: list[dict]) -> None:
-        self.entry |= {"status": "rejected", "reasons": reasons}
-        for frame in self.entry["frames"]:
-            frame |= {"prepared": None, "mask": None, "valid": None}
 
-    def start(self) -> None:
-        """The frames as the report lists them."""
-        capture = self.capture
-        notes = capture.facts.get("notes")
-        self.entry |= {"surface": capture.facts.get("surface"), "notes": None if notes is None else str(notes)}
-        paths = [(path, "observation") for path in capture.images]
-        paths += [(capture.reference, "reference")] if capture.reference is not None else []
-        self.entry["frames"] = [
-            {
-                "name": _printable(capture.name(path) if path.is_relative_to(capture.folder) else path.name),
-                "role": role,
-                "status": "kept",
-                "reasons": [],
-                "warnings": [],
-                "original": self._relative(path),
-                "prepared": None,
-                "mask": None,
-                "valid": None,
-                "registration": None,
-                "quality": None,
-            }
-            for path, role in paths
-        ]
+def decode(capture: Capture, entry: GroupEntry) -> tuple[list[Photo], Photo | None]:
+    """The observations without those that occur twice, and the treated reference."""
+    for path in capture.images:
+        if str(path) != printable(str(path)):
+            raise ValueError(f"{path}: the name is not valid Unicode text; rename the file")
+    decoded = decode_capture(capture)
+    size = decoded.images[0].size
+    entry.size = list(size)
+    if min(size) < MIN_SIDE:
+        raise ValueError(f"group {entry.group_id}: {size[0]}x{size[1]} pixels; a side has at least {MIN_SIDE}")
+    for index, first in decoded.duplicates.items():
+        entry.frames[index].drop([Remark("duplicate", f"the same picture as {entry.frames[first].name}")])
+    photos = [
+        Photo(entry.frames[index], capture.images[index], np.asarray(image), mask)
+        for index, image, mask in zip(decoded.kept, decoded.images, decoded.masks, strict=True)
+    ]
+    if decoded.reference is None:
+        return photos, None
+    return photos, Photo(entry.frames[-1], capture.reference, np.asarray(decoded.reference), None)
 
-    def decode(self) -> None:
-        for path in self.capture.images:
-            if str(path) != _printable(str(path)):
-                raise ValueError(f"{path}: the name is not valid Unicode text; rename the file")
-        self.decoded = decode_capture(self.capture)
-        size = self.decoded.images[0].size
-        self.entry["size"] = list(size)
-        if min(size) < MIN_SIDE:
-            raise ValueError(f"group {self.job.group_id}: {size[0]}x{size[1]} pixels; a side has at least {MIN_SIDE}")
-        for index, first in self.decoded.duplicates.items():
-            name = self.entry["frames"][first]["name"]
-            self._drop(self.entry["frames"][index], [reason("duplicate", f"the same picture as {name}")])
-        self.frames = [self.entry["frames"][index] for index in self.decoded.kept]
-        self.reference = self.entry["frames"][-1] if self.decoded.reference is not None else None
-        self.images = [np.asarray(image) for image in self.decoded.images]
-        self.treated = None if self.decoded.reference is None else np.asarray(self.decoded.reference)
-        self.masks = self.decoded.masks
 
-    def _drop(self, frame: dict, reasons: list[dict]) -> None:
-        frame |= {"status": "dropped", "reasons": reasons}
+def register_photos(
+    photos: list[Photo], reference: Photo | None, static: bool, settings: RegistrationSettings
+) -> None:
+    """Every other observation, and the treated reference, to the last observation."""
+    *others, last = photos
+    last.matrix = np.eye(3)
+    target = Frame(last.pixels, last.mask, settings)
+    for photo in others:
+        photo.decide(register(Frame(photo.pixels, photo.mask, settings), target, static))
+    if reference is None:
+        return
+    # Nobody draws a mask for it, and the camera may have moved a little: the target's, and some more.
+    side = 2 * round(0.01 * float(np.hypot(*target.size))) + 1
+    around = None if last.mask is None else cv2.dilate(last.mask.astype(np.uint8), np.ones((side, side))) > 0
+    reference.decide(register(Frame(reference.pixels, around, settings), target, static, treated=True))
+    if reference.warped:
+        text = "the camera moved before the treated reference was taken; it is warped"
+        reference.entry.warnings.append(Remark("reference_moved", text))
 
-    def prepare(self) -> dict:
-        """The staged group's metadata row."""
-        if any(mask is None for mask in self.masks):
-            self._propose()
-        self._register()
-        self._check()
-        return self._write()
 
-    def _register(self) -> None:
-        """Every other observation, and the treated reference, to the last observation."""
-        settings = self.settings.registration
-        static = self.settings.static_rig or self.capture.facts.get("static_rig", False)
-        target = Frame(self.images[-1], self.masks[-1], settings)
-        self.entry["target_frame"] = self.frames[-1]["name"]
-        self._valids: dict[str, np.ndarray] = {}
-        self.maps: list[np.ndarray | None] = []
-        for frame, image, mask in zip(self.frames[:-1], self.images, self.masks, strict=False):
-            self.maps.append(self._note(frame, register(Frame(image, mask, settings), target, static)))
-        self.maps.append(np.eye(3))
-        self.treated_map = None
-        if self.treated is not None:
-            # Nobody draws a mask for it, and the camera may have moved a little: the target's, and some more.
-            side = 2 * round(0.01 * float(np.hypot(*target.size))) + 1
-            around = (
-                None if self.masks[-1] is None else cv2.dilate(self.masks[-1].astype(np.uint8), np.ones((side, side)))
-            )
-            treated = Frame(self.treated, None if around is None else around > 0, settings)
-            result = register(treated, target, static, treated=True)
-            self.treated_map = self._note(self.reference, result)
-            if result.status == "warped":
-                self.reference["warnings"].append(
-                    reason("reference_moved", "the camera moved before the treated reference was taken; it is warped")
-                )
+def propose_masks(photos: list[Photo], reference: Photo | None, static: bool, job: Job, entry: GroupEntry) -> None:
+    """Masks for a group that lacks some; they stay beside the dataset unless accepted."""
+    from gift_peft.prepare.proposals import propose, refine
 
-    def _note(self, frame: dict, result: Registration) -> np.ndarray | None:
-        """Put a decision into the report; the map to apply, None if the frame is dropped."""
-        keys = ("matches", "inliers", "inlier_ratio", "spread", "median_displacement", "corner_displacement")
-        keys += ("target_displacement", "expected_error", "contrast_threshold", "difference_before")
-        keys += ("difference_after", "paper_exact")
-        frame["status"] = result.status
-        frame["reasons"], frame["warnings"] = result.reasons, result.warnings
-        frame["registration"] = {
-            "method": result.method,
-            "homography": None if result.matrix is None else result.matrix.tolist(),
-            **{key: result.figures.get(key) for key in keys},
-        }
-        if "with_additions" in result.figures:
-            frame["registration"]["with_additions"] = result.figures["with_additions"]
-        return result.matrix
+    drawn = [photo.mask for photo in photos]
+    for photo in photos:
+        photo.mask = None
+    register_photos(photos, reference, static, job.settings.registration)
+    usable = [photo for photo in photos if not photo.dropped]
+    if len(usable) < 2:
+        raise Rejection("no_proposal", "fewer than two frames are registered, so nothing can be compared")
+    aligned = [photo.registered(photo.pixels) for photo in usable]
+    proposal = propose(aligned)
+    if job.settings.refine is not None and proposal.mask.any():
+        proposal = refine(proposal, aligned[-1], job.settings.refine)
+    folder = job.staging / "masks_proposed" / job.split / job.group_id
+    paths = []
+    for photo in usable if proposal.mask.any() else ():
+        photo.mask = warp(proposal.mask, np.linalg.inv(photo.matrix))
+        path = (folder / photo.entry.name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(photo.mask.astype(np.uint8) * 255).save(path)
+        paths.append(path.relative_to(job.staging).as_posix())
+    accepted = job.settings.accept_proposed_masks and bool(paths)
+    more = {"mask_area": float(proposal.mask.mean()), "accepted": accepted, "masks": paths}
+    entry.proposal = {key: value for key, value in asdict(proposal).items() if key != "mask"} | more
+    if not paths:
+        raise Rejection("no_proposal", "nothing stands out from noise and changes of the light")
+    if not accepted:
+        text = "masks are missing; look at the proposed ones, then copy them into masks/ or accept them"
+        raise Rejection("masks_proposed", f"{text} (--accept-proposed-masks)")
+    for photo, mask in zip(photos, drawn, strict=True):
+        if mask is not None:
+            photo.mask = mask
+        elif photo.mask is None:  # dropped above, and it will be again
+            photo.mask = np.zeros(photo.pixels.shape[:2], bool)
 
-    def _warped(self, array: np.ndarray, frame: dict, matrix: np.ndarray) -> np.ndarray:
-        return warp(array, matrix) if frame["status"] == "warped" else array
 
-    def _valid(self, frame: dict, matrix: np.ndarray) -> np.ndarray:
-        """(H, W) bool, computed once per frame: checks and files ask for it."""
-        if frame["name"] not in self._valids:
-            width, height = self.entry["size"]
-            whole = frame["status"] != "warped"
-            valid = np.ones((height, width), bool) if whole else valid_area(matrix, (width, height))
-            self._valids[frame["name"]] = valid
-        return self._valids[frame["name"]]
+def check(photos: list[Photo], reference: Photo | None, job: Job, entry: GroupEntry) -> None:
+    """Quality of the frames that registration left, which drops some of them, then of the group."""
+    settings = job.settings.quality
+    there = [photo for photo in photos if not photo.dropped]
+    names, grays = [photo.entry.name for photo in there], [photo.gray for photo in there]
+    smalls = [photo.small(photo.registered(photo.mask)) for photo in there]
+    changes = pairwise_changes(smalls)
+    found = check_frames(names, smalls, grays, len(there) - 1, changes, settings)
+    for photo, figures, reasons, warnings in zip(there, *found, strict=True):
+        photo.entry.quality = figures
+        photo.entry.warnings += warnings
+        if reasons:
+            photo.entry.drop(reasons)
+    if reference is not None and not reference.dropped:
+        check_reference(reference, photos[-1], smalls[-1], settings)
+    left = [index for index, photo in enumerate(there) if not photo.dropped]
+    areas = [smalls[index].mask_area for index in left]
+    most, complaint = check_group_change(changes[np.ix_(left, left)], settings)
+    measured = [photo.entry.quality for photo in there]
+    entry.quality = GroupQuality(
+        target_change=most,
+        mask_area=float(np.mean(areas)) if areas else None,
+        outside_change=max(figures.outside_change or 0.0 for figures in measured),
+        mask_iou=min((figures.mask_iou for figures in measured if figures.mask_iou is not None), default=None),
+    )
+    check_left(len(left), reference, job, entry)
+    if complaint is not None and job.split == "train":
+        raise Rejection("target_unchanged", complaint)
+    if complaint is not None:
+        entry.warnings.append(Remark("target_unchanged", complaint))
+    if job.split == "train" and not any(areas):
+        raise Rejection("masks_empty", "every mask is empty, so there is nothing to train on")
 
-    def _propose(self) -> None:
-        """Masks for a group that lacks some; they stay beside the dataset unless accepted."""
-        from gift_peft.prepare.proposals import propose, refine
 
-        drawn, self.masks = self.masks, [None] * len(self.masks)
-        self._register()
-        usable = [index for index, matrix in enumerate(self.maps) if matrix is not None]
-        if len(usable) < 2:
-            raise Rejection(reason("no_proposal", "fewer than two frames are registered, so nothing can be compared"))
-        aligned = [self._warped(self.images[index], self.frames[index], self.maps[index]) for index in usable]
-        proposal = propose(aligned)
-        if self.settings.refine is not None and proposal.mask.any():
-            proposal = refine(proposal, aligned[-1], self.settings.refine)
-        folder = self.job.staging / "masks_proposed" / self.job.split / self.job.group_id
-        paths = []
-        for index in usable if proposal.mask.any() else ():
-            mask = warp(proposal.mask, np.linalg.inv(self.maps[index]))
-            path = (folder / self.frames[index]["name"]).with_suffix(".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(mask.astype(np.uint8) * 255).save(path)
-            paths.append(path.relative_to(self.job.staging).as_posix())
-            self.masks[index] = mask
-        accepted = self.settings.accept_proposed_masks and bool(paths)
-        figures = {key: value for key, value in asdict(proposal).items() if key != "mask"}
-        self.entry["proposal"] = {
-            **figures,
-            "mask_area": float(proposal.mask.mean()),
-            "accepted": accepted,
-            "masks": paths,
-        }
-        if not paths:
-            raise Rejection(reason("no_proposal", "nothing stands out from noise and changes of the light"))
-        if not accepted:
-            text = "masks are missing; look at the proposed ones, then copy them into masks/ or accept them"
-            raise Rejection(reason("masks_proposed", f"{text} (--accept-proposed-masks)"))
-        for index, mask in enumerate(drawn):
-            if mask is not None:
-                self.masks[index] = mask
-            elif self.masks[index] is None:  # dropped above, and it will be again
-                self.masks[index] = np.zeros(self.images[index].shape[:2], bool)
+def check_reference(reference: Photo, last: Photo, target: SmallFrame, settings: QualitySettings) -> None:
+    """Only what concerns the picture as a whole and its surroundings: inside the target it differs by design."""
+    names, grays, unknown = [reference.entry.name, last.entry.name], [reference.gray] * 2, np.full((2, 2), np.nan)
+    figures, reasons, warnings = check_frames(names, [reference.small(last.mask), target], grays, 1, unknown, settings)
+    reference.entry.quality = ReferenceQuality(
+        **{f.name: getattr(figures[0], f.name) for f in fields(ReferenceQuality)}
+    )
+    reference.entry.warnings += [item for item in warnings[0] if item.code in ABOUT_REFERENCE]
+    if bad := [item for item in reasons[0] if item.code in ABOUT_REFERENCE]:
+        reference.entry.drop(bad)
 
-    def _check(self) -> None:
-        """Quality of the frames that are still there, then of the group."""
-        kept = [index for index, matrix in enumerate(self.maps) if matrix is not None]
-        target = kept.index(len(self.frames) - 1)
-        grays = [_gray(self.images[index]) for index in kept]
-        smalls = [
-            Small(
-                _gray(self._warped(self.images[index], self.frames[index], self.maps[index])),
-                self._warped(self.masks[index], self.frames[index], self.maps[index]),
-                self._valid(self.frames[index], self.maps[index]),
-            )
-            for index in kept
-        ]
-        quality = self.settings.quality
-        names = [self.frames[index]["name"] for index in kept]
-        changes = pairwise_changes(smalls)
-        for index, figures, reasons, warnings in zip(
-            kept, *check_frames(names, smalls, grays, target, changes, quality), strict=True
-        ):
-            frame = self.frames[index]
-            frame["quality"] = figures
-            frame["warnings"] = frame["warnings"] + warnings
-            if reasons:
-                self._drop(frame, reasons)
-                self.maps[index] = None
-        if self.treated_map is not None:
-            self._check_reference(smalls[target])
-        left = [position for position, index in enumerate(kept) if self.maps[index] is not None]
-        most, complaint = check_group_change(changes[np.ix_(left, left)], quality)
-        areas = [smalls[position].mask_area for position in left]
-        self.entry["quality"] = {
-            "target_change": most,
-            "mask_area": float(np.mean(areas)) if areas else None,
-            "outside_change": max(
-                (frame["quality"]["outside_change"] or 0.0 for frame in self.frames if frame["quality"]), default=None
-            ),
-            "mask_iou": min(
-                (
-                    frame["quality"]["mask_iou"]
-                    for frame in self.frames
-                    if frame["quality"] and frame["quality"]["mask_iou"] is not None
-                ),
-                default=None,
-            ),
-        }
-        self._check_count(len(left))
-        if complaint is not None:
-            item = reason("target_unchanged", complaint)
-            if self.job.split == "train":
-                raise Rejection(item)
-            self.entry["warnings"].append(item)
-        if self.job.split == "train" and not any(areas):
-            raise Rejection(reason("masks_empty", "every mask is empty, so there is nothing to train on"))
 
-    def _is_warped(self, index: int) -> bool:
-        return self.frames[index]["status"] == "warped"
+def check_left(count: int, reference: Photo | None, job: Job, entry: GroupEntry) -> None:
+    """Whether `count` observations are enough, with or without the treated reference."""
+    if reference is not None and reference.dropped:
+        text = "; ".join(item.text for item in reference.entry.reasons)
+        entry.warnings.append(Remark("reference_dropped", f"the treated reference is dropped: {text}"))
+    try:
+        check_count(job.group_id, count, job.split, reference is not None and not reference.dropped)
+    except ValueError:
+        frames = [frame for frame in entry.frames if frame.status == "dropped"]
+        dropped = "; ".join(f"{frame.name}: {', '.join(item.text for item in frame.reasons)}" for frame in frames)
+        taken = sum(frame.role == "observation" for frame in entry.frames)
+        text = f"{count} of {taken} observations are left; dropped are {dropped}"
+        raise Rejection("too_few_frames", text) from None
 
-    def _check_reference(self, target: Small) -> None:
-        frame = self.reference
-        gray = _gray(self.treated)
-        registered = _gray(self._warped(self.treated, frame, self.treated_map))
-        small = Small(registered, self.masks[-1], self._valid(frame, self.treated_map))
-        both, unknown = [small, target], np.full((2, 2), np.nan)  # inside the target it differs by design
-        names = [frame["name"], self.entry["target_frame"]]
-        figures, reasons, warnings = check_frames(names, both, [gray, gray], 1, unknown, self.settings.quality)
-        about = ("clipped_dark", "clipped_bright", "outside_change", "outside_correlation")
-        frame["quality"] = {key: figures[0][key] for key in about}
-        codes = ("too_dark", "too_bright", "another_scene", "outside_change")
-        frame["warnings"] = frame["warnings"] + [item for item in warnings[0] if item["code"] in codes]
-        bad = [item for item in reasons[0] if item["code"] in codes]
-        if bad:
-            self._drop(frame, bad)
-            self.treated_map = None
 
-    def _check_count(self, count: int) -> None:
-        has_reference = self.treated_map is not None
-        if self.reference is not None and not has_reference:
-            text = "; ".join(item["text"] for item in self.reference["reasons"])
-            self.entry["warnings"].append(reason("reference_dropped", f"the treated reference is dropped: {text}"))
-        try:
-            check_count(self.job.group_id, count, self.job.split, has_reference)
-        except ValueError:
-            dropped = [
-                f"{frame['name']}: {', '.join(item['text'] for item in frame['reasons'])}"
-                for frame in self.entry["frames"]
-                if frame["status"] == "dropped"
-            ]
-            text = f"{count} of {len(self.capture.images)} observations are left; dropped are {'; '.join(dropped)}"
-            raise Rejection(reason("too_few_frames", text)) from None
-
-    def _write(self) -> dict:
-        kept = [index for index, matrix in enumerate(self.maps) if matrix is not None]
-        reference = None if self.treated_map is None else self.capture.reference
-        moved = [index for index in kept if self._is_warped(index)]
+def write(photos: list[Photo], reference: Photo | None, surface: str | None, job: Job) -> dict:
+    """Stage the group of these photos, note their files in their entries, and return the metadata row."""
+    treated = [] if reference is None or reference.dropped else [reference]
+    valids = []
+    if any(photo.warped for photo in (*photos, *treated)):
         # Where the reference has no pixels nothing can be compared with it, in any frame.
-        everywhere = None
-        if reference is not None and self.reference["status"] == "warped":
-            everywhere = self._valid(self.reference, self.treated_map)
-            reference = Image.fromarray(warp(self.treated, self.treated_map))
-        valids = []
-        if moved or everywhere is not None:
-            valids = [self._valid(self.frames[index], self.maps[index]) for index in kept]
-            valids = [valid if everywhere is None else valid & everywhere for valid in valids]
-        row = write_group(
-            {
-                "split": self.job.split,
-                "group_id": self.job.group_id,
-                "surface": self.entry["surface"],
-                "image_names": [self.frames[index]["name"] for index in kept],
-                "images": [
-                    Image.fromarray(warp(self.images[index], self.maps[index]))
-                    if index in moved
-                    else self.capture.images[self.decoded.kept[index]]
-                    for index in kept
-                ],
-                "masks": [self._warped(self.masks[index], self.frames[index], self.maps[index]) for index in kept],
-                "valids": valids,
-                "reference": reference,
-            },
-            self.job.staging,
-        )
-        for position, index in enumerate(kept):
-            for key, column in (("prepared", "images"), ("mask", "masks"), ("valid", "valids")):
-                if row[f"{column}_file_names"]:
-                    self.frames[index][key] = f"{self.job.split}/{row[f'{column}_file_names'][position]}"
-        if reference is not None:
-            self.reference["prepared"] = f"{self.job.split}/{row['reference_file_name']}"
-        if self.capture.proxies:
-            self._write_proxies(kept)
-        return row
-
-    def _write_proxies(self, kept: list[int]) -> None:
-        """Stored predictions follow their frames, by the nearest pixel; whose they are is not known, so they stay
-        beside the dataset (`proxies_given/`) and `gift-peft proxies` makes those that train."""
-        if len(self.capture.proxies) != len(self.capture.images):
-            raise ValueError(f"group {self.job.group_id}: {len(self.capture.proxies)} proxies for its images")
-        folder = self.job.staging / "proxies_given" / self.job.split / self.job.group_id
-        for index in kept:
-            path = self.capture.proxies[self.decoded.kept[index]]
-            proxy = read_proxy(path)
-            if self._is_warped(index):
-                proxy = warp_stored(proxy, self.maps[index], tuple(self.entry["size"]))
-            target = (folder / self.frames[index]["name"]).with_suffix(".npy")
-            target.parent.mkdir(parents=True, exist_ok=True)
-            np.save(target, proxy)
-
-
-def _gray(image: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-
-def _printable(text: str) -> str:
-    """File names may hold bytes that are no text; a report may not."""
-    return text.encode("utf-8", "backslashreplace").decode()
-
-
-def _finite(value):
-    """JSON has no NaN: what could not be measured is null, however deep it lies."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+        valids = [np.logical_and.reduce([photo.valid, *(shown.valid for shown in treated)]) for photo in photos]
+    row = write_group(
+        {
+            "split": job.split,
+            "group_id": job.group_id,
+            "surface": surface,
+            "image_names": [photo.entry.name for photo in photos],
+            "images": [photo.picture for photo in photos],
+            "masks": [photo.registered(photo.mask) for photo in photos],
+            "valids": valids,
+            "reference": treated[0].picture if treated else None,
+        },
+        job.staging,
+    )
+    for key, column in (("prepared", "images"), ("mask", "masks"), ("valid", "valids")):
+        for photo, path in zip(photos, row[f"{column}_file_names"], strict=False):
+            setattr(photo.entry, key, f"{job.split}/{path}")
+    for shown in treated:
+        shown.entry.prepared = f"{job.split}/{row['reference_file_name']}"
+    return row

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-MAX_PIXELS = 40_000  # of a picture that take part in a fit; more make it slower, not surer
+MAX_PIXELS = 40_000  # of a picture that take part in a fit; more make it slower, not more exact
 MIN_PIXELS = 300
 MAX_STEPS = 25
 SETTLED = 0.005  # pixels
 GROSS = 2.0  # pixels, the paper's reprojection threshold
-TUKEY = 4.685  # in standard deviations: 95 % efficient on Gaussian residuals, deaf to everything far beyond
+TUKEY = 4.685  # in standard deviations: 95 % efficient on Gaussian residuals, and ignores what lies far beyond
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Fit:
 
     Args:
         matrix (`np.ndarray`): (3, 3) float64, fixed to moving coordinates in pixels, [2, 2] = 1.
-        covariance (`np.ndarray`): (8, 8) of the parameters in normalised coordinates.
-        frame (`np.ndarray`): (3, 3), pixels to normalised coordinates.
+        covariance (`np.ndarray`): (8, 8) of the parameters in normalized coordinates.
+        frame (`np.ndarray`): (3, 3), pixels to normalized coordinates.
         sigma (`float`): standard deviation of the residuals (pixels, or units of the pictures fitted).
         correlation (`float`): of the two pictures over the pixels used; 1 for points.
     """
@@ -37,8 +37,8 @@ class Fit:
 
     def expected_error(self, points: np.ndarray) -> float:
         """The largest expected distance, in pixels, between where `points` (N, 2) are mapped and where they belong."""
-        normalised = transform(self.frame, points)
-        jacobian = _jacobian(normalised, self.frame @ self.matrix @ np.linalg.inv(self.frame))
+        normalized = transform(self.frame, points)
+        jacobian = _jacobian(normalized, self.frame @ self.matrix @ np.linalg.inv(self.frame))
         variances = np.einsum("nij,jk,nik->n", jacobian, self.covariance, jacobian)
         return float(np.sqrt(max(variances.max(), 0.0)) / self.frame[0, 0])
 
@@ -84,7 +84,7 @@ def fit_points(fixed: np.ndarray, moving: np.ndarray, start: np.ndarray, size: t
     """
     frame = _frame(size)
     source, goal = transform(frame, fixed), transform(frame, moving)
-    matrix = _normalise(frame @ start @ np.linalg.inv(frame))
+    matrix = _normalize(frame @ start @ np.linalg.inv(frame))
     for _ in range(20):
         residual = goal - transform(matrix, source)
         distance = np.linalg.norm(residual, axis=1)
@@ -99,8 +99,8 @@ def fit_points(fixed: np.ndarray, moving: np.ndarray, start: np.ndarray, size: t
         matrix = matrix + np.append(step, 0.0).reshape(3, 3)
         if np.abs(step).max() < 1e-9:
             break
-    # For the covariance every match counts that is no gross outlier: a few dozen of which half agree closely look
-    # surer than they are.
+    # For the covariance every match counts that is no gross outlier. With a few dozen matches, the half that agrees
+    # best would promise too small an error.
     near = distance[distance < GROSS * frame[0, 0]]
     honest = max(float(np.sqrt(np.square(near).sum() / max(2 * len(near) - 8, 1))), sigma)
     return Fit(_in_pixels(matrix, frame), np.linalg.inv(normal) * honest**2, frame, honest / frame[0, 0])
@@ -108,7 +108,7 @@ def fit_points(fixed: np.ndarray, moving: np.ndarray, start: np.ndarray, size: t
 
 @dataclass(frozen=True)
 class Level:
-    """A picture at one resolution: (h, w) float32 locally normalised, and (h, w) bool usable pixels."""
+    """A picture at one resolution: (h, w) float32 locally normalized, and (h, w) bool usable pixels."""
 
     image: np.ndarray
     usable: np.ndarray
@@ -120,7 +120,7 @@ def pyramid(gray: np.ndarray, usable: np.ndarray) -> list[Level]:
     small = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
     usable_small = cv2.resize(usable.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.999
     return [
-        Level(normalise_contrast(picture, mask), mask) for picture, mask in ((small, usable_small), (gray, usable))
+        Level(normalize_contrast(picture, mask), mask) for picture, mask in ((small, usable_small), (gray, usable))
     ]
 
 
@@ -151,7 +151,7 @@ def _fit_level(fixed: Level, moving: Level, start: np.ndarray) -> Fit | None:
     source = transform(frame, points)
     values = fixed.image[points[:, 1], points[:, 0]].astype(np.float64)
     gradients = [cv2.Sobel(moving.image, cv2.CV_32F, dx, dy, scale=1 / 8) for dx, dy in ((1, 0), (0, 1))]
-    matrix = _normalise(frame @ start @ np.linalg.inv(frame))
+    matrix = _normalize(frame @ start @ np.linalg.inv(frame))
     for _ in range(MAX_STEPS):
         at = transform(np.linalg.inv(frame), transform(matrix, source))
         inside = (at > 1).all(axis=1) & (at[:, 0] < width - 2) & (at[:, 1] < height - 2)
@@ -181,7 +181,7 @@ def _fit_level(fixed: Level, moving: Level, start: np.ndarray) -> Fit | None:
     return Fit(_in_pixels(matrix, frame), np.linalg.inv(normal) * sigma**2 * 12, frame, sigma, correlation)
 
 
-def normalise_contrast(gray: np.ndarray, usable: np.ndarray) -> np.ndarray:
+def normalize_contrast(gray: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """(H, W) uint8 to float32 with local mean 0 and local deviation near 1: brightness changes fall out.
 
     Only `usable` pixels, (H, W) bool, count in a neighbourhood, else a change inside the target would leak out of it.
@@ -230,8 +230,8 @@ def _jacobian(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(rows) / scale, 2, 0)
 
 
-def _tukey(normalised: np.ndarray) -> np.ndarray:
-    return np.square(np.clip(1 - np.square(normalised / TUKEY), 0, None))
+def _tukey(normalized: np.ndarray) -> np.ndarray:
+    return np.square(np.clip(1 - np.square(normalized / TUKEY), 0, None))
 
 
 def _solvable(normal: np.ndarray) -> bool:
@@ -245,9 +245,9 @@ def _frame(size: tuple[int, int]) -> np.ndarray:
     return np.array([[scale, 0, -scale * (width - 1) / 2], [0, scale, -scale * (height - 1) / 2], [0, 0, 1]])
 
 
-def _normalise(matrix: np.ndarray) -> np.ndarray:
+def _normalize(matrix: np.ndarray) -> np.ndarray:
     return matrix / matrix[2, 2]
 
 
 def _in_pixels(matrix: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    return _normalise(np.linalg.inv(frame) @ matrix @ frame)
+    return _normalize(np.linalg.inv(frame) @ matrix @ frame)

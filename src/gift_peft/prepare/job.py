@@ -14,7 +14,8 @@ FORMAT = 1  # of records and report; a new one makes every group again
 
 @dataclass(frozen=True)
 class Job:
-    """One group to prepare: `source` is its folder, or the capture itself; `known` the digest it was made from."""
+    """One group to prepare: `source` is its folder, or the capture itself; `known` the digest of what it was made from
+    in an earlier run."""
 
     raw: Path
     staging: Path
@@ -27,15 +28,17 @@ class Job:
     def folder(self) -> Path:
         return self.source.folder if isinstance(self.source, Capture) else self.source
 
+    def relative(self, path: Path) -> str:
+        """A path below RAW as the report states it."""
+        return printable(path.relative_to(self.raw).as_posix())
+
     @property
     def group_id(self) -> str:
         if isinstance(self.source, Capture):
             return self.source.group_id
         if self.settings.layout is None:
             return self.source.name
-        start = self.raw / self.settings.layout.root / self.settings.layout.splits[self.split]
-        inside = self.source.relative_to(start).as_posix()
-        return self.source.name if inside == "." else inside.replace("/", "__")
+        return self.settings.layout.group_id(self.source, self.split, self.raw)
 
     def read(self) -> Capture:
         if isinstance(self.source, Capture):
@@ -47,20 +50,19 @@ class Job:
 
 @dataclass
 class Outcome:
-    """What became of a group: its entry in the report, its metadata row if it is kept (now in the staging folder), and
-    the digest of what it was made from; `unchanged`: the digest is the known one, and nothing was done."""
+    """What became of a group: the digest of what it was made from, its entry in the report, and its metadata row if it
+    is kept (then it lies in the staging folder)."""
 
     digest: str | None
     entry: dict
     row: dict | None = None
-    unchanged: bool = False
 
 
 def capture_digest(capture: Capture, settings: PrepareSettings) -> str:
     """Of the content of every file that decides what becomes of the group, and of the settings."""
     stated = json.dumps([FORMAT, capture.split, asdict(settings)], sort_keys=True)
     digest = hashlib.blake2b(stated.encode(), digest_size=16)
-    files = [*capture.images, *capture.proxies, capture.folder / "group.yaml"]
+    files = [*capture.images, capture.folder / "group.yaml"]
     files += [path for mask in capture.masks if mask is not None for path in mask.files]
     files += [capture.reference] if capture.reference is not None else []
     for path in dict.fromkeys(files):
@@ -69,3 +71,8 @@ def capture_digest(capture: Capture, settings: PrepareSettings) -> str:
                 content = hashlib.file_digest(file, "blake2b").hexdigest()
             digest.update(f"\n{os.path.relpath(path, capture.folder)} {content}".encode(errors="surrogateescape"))
     return digest.hexdigest()
+
+
+def printable(text: str) -> str:
+    """File names may hold bytes that are no text; a report may not."""
+    return text.encode("utf-8", "backslashreplace").decode()

@@ -1,7 +1,7 @@
 """The paper's matching between two frames: SIFT, ratio test, displacement filter, MAGSAC (supplement A).
 
-What it adds: features only outside the target where asked, one match per feature, and a least-squares fit to all
-matches that agree, whose covariance says how well they fix the map at the target's corners.
+Added to it: on request only features outside the target, with one match per feature; and a least-squares fit to all
+matches that agree. Its covariance says how exact the map is at the target's corners.
 """
 
 from dataclasses import dataclass
@@ -11,59 +11,7 @@ import cv2
 import numpy as np
 
 from gift_peft.prepare.homography import Fit, Level, corners_of, fit_points, pyramid, transform
-
-
-@dataclass(frozen=True)
-class RegistrationSettings:
-    """Thresholds of `register`; lengths are in pixels of the photos. The first nine are the paper's.
-
-    Args:
-        contrast_threshold, edge_threshold (`float`): SIFT's.
-        ratio (`float`): Lowe's ratio test.
-        displacement_filter (`float`): matches whose displacement is this far from the median one are removed.
-        reprojection_threshold, confidence, max_iterations: of MAGSAC, and of RANSAC where that gives nothing.
-        min_inlier_ratio (`float`): inliers among the displacement-filtered matches, below which a frame is dropped.
-        paper_exact (`bool`): decide by the paper's numbers alone; what the rest would have done is only recorded.
-        min_contrast_threshold (`float`): how far the contrast threshold may be halved.
-        target_margin (`int`): features and pixels this close to the target do not count.
-        min_inliers (`int`): matches outside the target that agree.
-        min_spread (`float`): of those inliers, the deviation along the direction in which they spread least, as a
-            fraction of the image diagonal.
-        identity_displacement (`float`): a median displacement below this is no motion.
-        max_target_error (`float`): expected error of the map at the target's corners.
-        max_displacement (`float`): of any corner of the frame or of the target, as a fraction of the image diagonal.
-        max_distortion (`float`): change of any local length by the map, as a fraction.
-        min_correlation (`float`): of the locally normalised pixels outside the target with those of the target frame.
-    """
-
-    contrast_threshold: float = 0.08
-    edge_threshold: float = 10.0
-    ratio: float = 0.70
-    displacement_filter: float = 20.0
-    reprojection_threshold: float = 2.0
-    confidence: float = 0.9995
-    max_iterations: int = 5000
-    min_inlier_ratio: float = 0.90
-    paper_exact: bool = False
-    min_contrast_threshold: float = 0.02
-    target_margin: int = 8
-    min_inliers: int = 20
-    min_spread: float = 0.02
-    identity_displacement: float = 0.5
-    max_target_error: float = 0.5
-    max_displacement: float = 0.06
-    max_distortion: float = 0.08
-    min_correlation: float = 0.5
-
-    def __post_init__(self):
-        for name in ("contrast_threshold", "min_contrast_threshold", "edge_threshold", "reprojection_threshold"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ValueError(f"{name}: must be positive and finite, got {getattr(self, name)}")
-        if not 0 < self.confidence < 1:
-            raise ValueError(f"confidence: must be between 0 and 1, got {self.confidence}")
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations: must be at least 1, got {self.max_iterations}")
-
+from gift_peft.prepare.settings import RegistrationSettings
 
 MAX_FEATURES = 6000
 

@@ -1,4 +1,4 @@
-"""`report.html` of a prepared dataset: one file without scripts or links, made from `report.json` (`captures.py`).
+"""`report.html` of a prepared dataset: one file without scripts or links, made from `report.json` (`entries.py`).
 
 Statistics at the top, then a row per group: every frame with its mask's outline, what was done to it and why. The
 flicker box of a group lets its frames alternate with the one they were registered to, which shows a camera that moved
@@ -75,8 +75,8 @@ def write_html(out: Path, report: dict) -> Path:
 
     Args:
         out (`Path`): the prepared folder, whose pictures are embedded as thumbnails.
-        report (`dict`): what `captures.prepare` writes as `report.json`; its docstring has the form. A picture that
-            is not there or cannot be read becomes an empty frame.
+        report (`dict`): what `prepare_gift_i` writes as `report.json`. A picture that is not there or cannot be read
+            becomes an empty frame.
 
     Raises:
         OSError: the file cannot be written.
@@ -210,22 +210,28 @@ def _frame(frame: dict, group: dict, target: Image.Image | None, out: Path, raw:
 
 
 def _figures(frames: list[dict]) -> str:
-    """Every figure of every frame, what the paper's rule alone would have said of its registration included."""
+    """Every figure of every frame; with --paper-exact also what the paper's rule says of its registration."""
+    if not any(frame.get("registration") or frame.get("quality") for frame in frames):
+        return ""
     measured = list(dict.fromkeys(key for frame in frames for key in frame.get("quality") or {}))
+    exact = any((frame.get("registration") or {}).get("paper_exact") for frame in frames)
     rows = []
     for frame in frames:
         found, quality = frame.get("registration") or {}, frame.get("quality") or {}
-        paper = found.get("paper_exact") or {}
-        verdict = {True: "accepts", False: "refuses"}.get(paper.get("accepted"), "–")
-        if paper.get("corner_displacement") is not None:
-            verdict += f", corner {_number(paper['corner_displacement'], '.1f')} px"
         cells = [_number(found.get(key), form) for key, (_, form) in FIGURES.items()]
-        rows.append([frame["name"], *cells, verdict, *(_number(quality.get(key)) for key in measured)])
-    if not any(frame.get("registration") or frame.get("quality") for frame in frames):
-        return ""
-    head = ["frame", *(heading for heading, _ in FIGURES.values()), "the paper's rule alone"]
+        cells += [_verdict(found.get("paper_exact"))] if exact else []
+        rows.append([frame["name"], *cells, *(_number(quality.get(key)) for key in measured)])
+    head = ["frame", *(heading for heading, _ in FIGURES.values()), *(["the paper's rule alone"] if exact else [])]
     head += [key.replace("_", " ") for key in measured]
     return f"<details><summary>Figures</summary>{_table(head, rows)}</details>"
+
+
+def _verdict(paper: dict | None) -> str:
+    if not paper:
+        return "–"
+    moved = paper.get("corner_displacement")
+    corner = "" if moved is None else f", corner {_number(moved, '.1f')} px"
+    return ("accepts" if paper["accepted"] else "refuses") + corner
 
 
 # ---- pictures ----

@@ -1,61 +1,14 @@
 """From a folder of raw photos to a checked, loadable GIFT-I: `gift-peft prepare RAW OUT` (paper, supplement A).
 
-Each group is read (`raw.py`), registered to its last observation (`registration.py`), checked (`quality.py`) and
-written whole or not at all (`writer.py`); about every frame the report says why it was kept, moved or dropped.
-
-The report, `OUT/report.json`, is one object; paths are relative and use forward slashes:
-
-```
-format            1
-raw               RAW, relative to OUT
-settings          {"registration": {threshold: value}, "quality": {threshold: value}, and the other arguments}
-versions          {"gift-peft", "opencv", "numpy", "pillow", "python"}
-removed           group ids ("train/a") that an earlier run had made and that RAW no longer has
-statistics        {"train" | "validation": {"groups", "images", "pairs", "references", "rejected_groups",
-                  "dropped_frames", "warped_frames", "group_size": {"min", "max", "mean"} or null,
-                  "mask_area": {"min", "max", "mean"} (fraction of the image) or null}}; no empty splits
-groups            list, in the order of the dataset, of:
-  group_id        string
-  split           "train" | "validation"
-  surface         "mirror" | "transparent" | null
-  notes           string | null (group.yaml)
-  folder          the group's folder, relative to RAW
-  status          "kept" | "rejected"
-  reasons         list of {"code", "text"}: why it was rejected, [] if kept
-  warnings        list of {"code", "text"} about the group as a whole
-  size            [width, height] | null (unreadable)
-  target_frame    name of the observation that the others are registered to | null
-  quality         {"outside_change", "target_change", "mask_area", "mask_iou"}, null where not measurable
-  proposal        null | {"score", "accepted", "refined", "masks": [paths of masks_proposed/..., relative to OUT],
-                  "mask_area", and the other figures of `proposals.Proposal`}
-  frames          list, natural order, the treated reference last, of:
-    name          the image's path inside the group's folder (what `image_names` holds)
-    role          "observation" | "reference"
-    status        "kept" (the frame that others are registered to, or one not judged when its group was rejected)
-                  | "identity" (camera did not move: not resampled) | "warped" | "dropped"
-    reasons       list of {"code", "text"}: why dropped, [] otherwise
-    warnings      list of {"code", "text"}
-    original      path relative to RAW
-    prepared      path relative to OUT | null
-    mask          prepared mask, relative to OUT | null (always null for the reference)
-    valid         prepared valid mask, relative to OUT | null
-    registration  null (target frame, or never reached) | {"method" (of `registration.Registration`),
-                  "homography": 3 rows of 3 floats, frame -> target frame in pixels | null,
-                  "matches", "inliers", "inlier_ratio", "spread", "median_displacement", "corner_displacement",
-                  "target_displacement", "expected_error" (px at the target's corners), "contrast_threshold",
-                  "difference_before", "difference_after" (mean absolute grey difference outside the target, 0-255),
-                  "paper_exact": {"accepted": bool, "matches", "inliers", "inlier_ratio", "corner_displacement"},
-                  with --paper-exact also "with_additions": {"status", "reasons"}}; any figure may be null
-    quality       null | {"sharpness" (relative to the group's median), "clipped_dark", "clipped_bright",
-                  "outside_change", "outside_correlation", "target_change", "mask_area", "mask_border", "mask_iou"}
-```
+Each group is read, registered to its last observation, checked, and written whole or not at all (`group.py`). About
+every frame the report says why it was kept, moved or dropped; `entries.py` types what `report.json` holds.
 """
 
 import json
 import os
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -66,20 +19,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import PIL
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from gift_peft.captures.tree import find_groups
 from gift_peft.dataset.writer import write_card, write_rows
 from gift_peft.files import write_whole
+from gift_peft.prepare.entries import Statistics
 from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import FORMAT, Job, Outcome
+from gift_peft.prepare.page import write_html
 from gift_peft.prepare.settings import PrepareSettings
 from gift_peft.rules import SPLITS
 
 STATE = ".prepare"  # in OUT: one record per finished group, and groups on their way
-BESIDE = ("masks_proposed", "proxies_given")  # what a group may leave in OUT besides its folder
 
 
 def prepare_gift_i(
@@ -128,8 +81,6 @@ def prepare_gift_i(
             for name in ("README.md", "groups.jsonl"):
                 (out / name).unlink(missing_ok=True)
         write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False))
-        from gift_peft.prepare.page import write_html
-
         write_html(out, report)
     return report
 
@@ -152,18 +103,18 @@ def _make_groups(
     records = {(job.split, job.group_id): _read_record(out, job) for job in jobs}
     removed = _remove_others(out, records.keys())
     kept = {key: record["row"] for key, record in records.items() if record and record["row"]}
-    _write_rows(out, kept, jobs)
+    write_rows(_rows(kept, jobs), out)
     jobs = [replace(job, known=(records[job.split, job.group_id] or {}).get("digest")) for job in jobs]
     with tqdm(total=len(jobs), desc="groups", unit="group", disable=None) as bar:
         for job, outcome in _run(jobs, num_proc):
-            if not outcome.unchanged:
+            if outcome.digest is None or outcome.digest != job.known:
                 key = job.split, job.group_id
                 if kept.pop(key, None):  # first the table, then the files: the table never names what is not there
-                    _write_rows(out, kept, jobs)
+                    write_rows(_rows(kept, jobs), out)
                 _install(out, job, outcome)
                 if outcome.row is not None:
                     kept[key] = outcome.row
-                    _write_rows(out, kept, jobs)
+                    write_rows(_rows(kept, jobs), out)
                 records[key] = _write_record(out, job, outcome)
             bar.update()
     entries = [records[job.split, job.group_id]["entry"] for job in jobs]
@@ -223,8 +174,13 @@ def _record_path(out: Path, split: str, group_id: str) -> Path:
     return out / STATE / split / f"{group_id}.json"
 
 
+def _places(root: Path, split: str, group_id: str) -> tuple[Path, Path]:
+    """A group's folder, in OUT or the staging folder, and that of its proposed masks."""
+    return root / split / group_id, root / "masks_proposed" / split / group_id
+
+
 def _read_record(out: Path, job: Job) -> dict | None:
-    """What an earlier run noted about a group, if everything it made is still there."""
+    """What an earlier run noted about a group; None if a file that it made is missing or has another size."""
     path = _record_path(out, job.split, job.group_id)
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
@@ -237,55 +193,44 @@ def _read_record(out: Path, job: Job) -> dict | None:
 
 
 def _write_record(out: Path, job: Job, outcome: Outcome) -> dict:
-    """Last of all steps of a group: only what has a record is finished."""
-    places = [out / job.split / job.group_id, *(out / name / job.split / job.group_id for name in BESIDE)]
+    """The last step of a group: only a group with a record counts as finished."""
     files = {
         path.relative_to(out).as_posix(): path.stat().st_size
-        for place in places
+        for place in _places(out, job.split, job.group_id)
         for path in sorted(place.rglob("*"))
         if path.is_file()
     }
-    record = {
-        "format": FORMAT,
-        "digest": outcome.digest,
-        "row": outcome.row,
-        "entry": outcome.entry,
-        "files": files,
-    }
+    record = {"format": FORMAT, **vars(outcome), "files": files}
     write_whole(_record_path(out, job.split, job.group_id), json.dumps(record, allow_nan=False))
     return record
 
 
 def _install(out: Path, job: Job, outcome: Outcome) -> None:
-    """Put a staged group, and what belongs beside it, in the place of what was there."""
+    """Put a staged group and its proposed masks in the place of what was there."""
     _record_path(out, job.split, job.group_id).unlink(missing_ok=True)
-    for place in (Path(job.split), *(Path(name) / job.split for name in BESIDE)):
-        made, target = job.staging / place / job.group_id, out / place / job.group_id
-        if place == Path(job.split) and outcome.row is None:
-            shutil.rmtree(made, ignore_errors=True)
+    made, proposed = _places(job.staging, job.split, job.group_id)
+    if outcome.row is None:
+        shutil.rmtree(made, ignore_errors=True)
+    for staged, target in zip((made, proposed), _places(out, job.split, job.group_id), strict=True):
         shutil.rmtree(target, ignore_errors=True)
-        if made.is_dir():
+        if staged.is_dir():
             target.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(made, target)
+            os.replace(staged, target)
 
 
-def _remove_others(out: Path, wanted) -> list[str]:
-    """Take out of OUT what earlier runs made of groups that are gone from RAW; which these were."""
-    removed = []
-    for split in SPLITS:
-        for path in sorted((out / STATE / split).glob("*.json")):
-            if (split, path.stem) in wanted:
-                continue
-            removed.append(f"{split}/{path.stem}")
-    if removed:
-        # Tables first, as everywhere; the caller writes the new ones.
+def _remove_others(out: Path, wanted: Collection[tuple[str, str]]) -> list[str]:
+    """Remove what earlier runs made of groups that RAW no longer has, and return the names of these groups."""
+    records = [(split, path.stem) for split in SPLITS for path in sorted((out / STATE / split).glob("*.json"))]
+    gone = [key for key in records if key not in wanted]
+    if gone:
+        # First the tables, so that they never name a group that is not there; the caller writes the new ones.
         for split in SPLITS:
             (out / split / "metadata.parquet").unlink(missing_ok=True)
-    for name in removed:
-        for place in (out, *(out / beside for beside in BESIDE)):
-            shutil.rmtree(place / name, ignore_errors=True)
-        (out / STATE / f"{name}.json").unlink()
-    return removed
+    for key in gone:
+        for place in _places(out, *key):
+            shutil.rmtree(place, ignore_errors=True)
+        _record_path(out, *key).unlink()
+    return ["/".join(key) for key in gone]
 
 
 def _rows(kept: dict[tuple[str, str], dict], jobs: list[Job]) -> dict[str, dict[str, dict]]:
@@ -297,14 +242,11 @@ def _rows(kept: dict[tuple[str, str], dict], jobs: list[Job]) -> dict[str, dict[
     return rows
 
 
-def _write_rows(out: Path, kept: dict, jobs: list[Job]) -> None:
-    write_rows(_rows(kept, jobs), out)
-
-
 # ---- the report ----
 
 
 def _report(raw: Path, out: Path, settings: PrepareSettings, entries: list[dict], removed: list[str]) -> dict:
+    splits = {split: [entry for entry in entries if entry["split"] == split] for split in SPLITS}
     return {
         "format": FORMAT,
         "raw": Path(os.path.relpath(raw.resolve(), out.resolve())).as_posix(),
@@ -313,20 +255,16 @@ def _report(raw: Path, out: Path, settings: PrepareSettings, entries: list[dict]
             "gift-peft": version("gift-peft"),
             "opencv": cv2.__version__,
             "numpy": np.__version__,
-            "pillow": PIL.__version__,
+            "pillow": version("pillow"),
             "python": platform.python_version(),
         },
         "removed": removed,
-        "statistics": {
-            split: _statistics([entry for entry in entries if entry["split"] == split])
-            for split in SPLITS
-            if any(entry["split"] == split for entry in entries)
-        },
+        "statistics": {split: asdict(_statistics(found)) for split, found in splits.items() if found},
         "groups": entries,
     }
 
 
-def _statistics(entries: list[dict]) -> dict:
+def _statistics(entries: list[dict]) -> Statistics:
     kept = [entry for entry in entries if entry["status"] == "kept"]
     frames = [frame for entry in kept for frame in entry["frames"]]
     sizes = [
@@ -334,17 +272,17 @@ def _statistics(entries: list[dict]) -> dict:
         for entry in kept
     ]
     areas = [frame["quality"]["mask_area"] for frame in frames if frame["mask"] is not None]
-    return {
-        "groups": len(kept),
-        "images": sum(sizes),
-        "pairs": sum(size * (size - 1) // 2 for size in sizes),
-        "references": sum(frame["role"] == "reference" and frame["status"] != "dropped" for frame in frames),
-        "rejected_groups": len(entries) - len(kept),
-        "dropped_frames": sum(frame["status"] == "dropped" for frame in frames),
-        "warped_frames": sum(frame["status"] == "warped" for frame in frames),
-        "group_size": _range(sizes),
-        "mask_area": _range(areas),
-    }
+    return Statistics(
+        groups=len(kept),
+        images=sum(sizes),
+        pairs=sum(size * (size - 1) // 2 for size in sizes),
+        references=sum(frame["role"] == "reference" and frame["status"] != "dropped" for frame in frames),
+        rejected_groups=len(entries) - len(kept),
+        dropped_frames=sum(frame["status"] == "dropped" for frame in frames),
+        warped_frames=sum(frame["status"] == "warped" for frame in frames),
+        group_size=_range(sizes),
+        mask_area=_range(areas),
+    )
 
 
 def _range(values: list) -> dict | None:

@@ -1,27 +1,37 @@
-"""`gift-peft prepare`: what it prints. Its options are the settings, `prepare` beside it does the work."""
+"""`gift-peft prepare`: its options, which are the fields of `settings.py`, and what it says at the end.
 
+A YAML file (`--config`) may state the same names; the command line wins.
+"""
+
+import argparse
+import difflib
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import Field, fields
 from pathlib import Path
 
-from gift_peft.prepare.settings import make_parser, parse_arguments
+from gift_peft.captures.foreign import read_layout
+from gift_peft.files import read_yaml
+from gift_peft.options import OptionParser
+from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
 
-__all__ = ["make_parser", "run"]
+PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
+DESCRIPTION = """From a folder of photos to a checked GIFT-I dataset: register, check, write, report.
+
+Exit code: 0 if every group is in OUT, 3 if some were rejected (the report says why), 1 if none could be made, or RAW
+or a configuration file is wrong, 2 for a wrong command line. Run again, it does what is left to do."""
 
 
 def run(argv: Sequence[str]) -> int:
-    """Prepare, and say in a few lines what came of it."""
+    """Prepare, say in a few lines what came of it, and return the exit code.
+
+    Raises ValueError or an OSError (one line) where nothing could be made; a wrong command line leaves by SystemExit.
+    """
     args = parse_arguments(argv)
     from gift_peft.prepare.prepare import prepare_gift_i
 
-    report = prepare_gift_i(
-        args.raw,
-        args.out,
-        args.settings,
-        num_proc=args.num_proc,
-        license=args.license,
-        pretty_name=args.pretty_name,
-    )
+    report = prepare_gift_i(**vars(args))
     for entry in report["groups"]:
         if entry["status"] == "rejected":
             text = entry["reasons"][0]["text"]
@@ -32,8 +42,95 @@ def run(argv: Sequence[str]) -> int:
             f"{found['dropped_frames']} dropped), {found['references']} references, "
             f"{found['rejected_groups']} groups rejected"
         )
-    print(f"Report: {Path(args.out) / 'report.html'}")
+    page = Path(args.out) / "report.html"
+    print(f"Report: {page}")
     kept = sum(found["groups"] for found in report["statistics"].values())
     if not kept:
-        raise ValueError(f"no group could be prepared; {Path(args.out) / 'report.html'} says why")
+        raise ValueError(f"no group could be prepared; {page} says why")
     return 0 if kept == len(report["groups"]) else 3
+
+
+def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
+    """The arguments of `prepare_gift_i`: `argv` (without the verb) over the file of `--config` over the defaults.
+
+    A wrong command line ends as argparse does it (exit code 2). Raises ValueError or FileNotFoundError naming the
+    YAML file and its key.
+    """
+    parser = make_parser()
+    values = vars(parser.parse_args(argv))
+    if values["config"] is not None:
+        values = vars(parser.parse_args([*_read_config(Path(values["config"])), *argv]))
+    del values["config"]
+    parts = {name: kind(**{key: values.pop(key) for key in _options(kind)}) for name, kind in PARTS.items()}
+    choices = {key: values.pop(key) for key in _options(PrepareSettings)}
+    choices["propose_masks"] |= choices["accept_proposed_masks"] or choices["refine"] is not None
+    choices["layout"] = None if choices["layout"] is None else read_layout(choices["layout"])
+    return argparse.Namespace(settings=PrepareSettings(**parts, **choices), **values)
+
+
+def make_parser() -> OptionParser:
+    parser = OptionParser("prepare", DESCRIPTION, "gift-peft prepare my-captures gift-i --num-proc 2")
+    parser.usage = "%(prog)s RAW OUT [options]"
+    parser.add_argument("raw", metavar="RAW", help="folder of group folders; it is only read")
+    parser.add_argument("out", metavar="OUT", help="prepared folder: new, or made by this command before")
+    parser.add_argument("--config", metavar="FILE", help="YAML file with values for the options below")
+    parser.add_argument(
+        "--num-proc", type=_number(int, 1), default=1, metavar="N", help="groups prepared side by side"
+    )
+    parser.add_argument("--license", default="unknown", metavar="ID", help="for the dataset card, as cc-by-4.0")
+    parser.add_argument("--pretty-name", metavar="NAME", help="for the dataset card; default: the name of RAW")
+    for kind in (PrepareSettings, *PARTS.values()):
+        group = parser if kind is PrepareSettings else parser.add_argument_group(*kind.__doc__.split(". ", 1))
+        for name, option in _options(kind).items():
+            form = {"metavar": option.metadata["metavar"]}
+            if isinstance(option.default, bool):
+                form = {"action": argparse.BooleanOptionalAction}
+            elif option.default is not None:
+                form["type"] = _number(type(option.default), option.metadata["least"])
+            spelling = f"--{name.replace('_', '-')}"
+            group.add_argument(spelling, default=option.default, help=option.metadata["help"], **form)
+    return parser
+
+
+def _options(kind: type) -> dict[str, Field]:
+    return {option.name: option for option in fields(kind) if option.metadata}
+
+
+def _number(kind: type, least: int) -> Callable[[str], float]:
+    def parse(text: str):
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value < math.inf:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a {kind.__name__} of at least {least}")
+        return value
+
+    return parse
+
+
+def _read_config(path: Path) -> list[str]:
+    """The file's values as words of a command line, checked by the same parser."""
+
+    def refuse(message: str):
+        raise ValueError(f"config {path}: {message}")
+
+    parser = make_parser()
+    parser.error = refuse
+    known = vars(parser.parse_args(["RAW", "OUT"]))
+    for key in ("raw", "out", "config"):
+        del known[key]
+    words = []
+    for key, value in read_yaml(path, f"config {path}").items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1)
+            refuse(f"unknown key {key!r}" + (f"; did you mean {near[0]}?" if near else ""))
+        flag = isinstance(known[key], bool)
+        if isinstance(value, list | dict) or flag != isinstance(value, bool):
+            refuse(f"{key}: {value!r}; expected {'true or false' if flag else 'one value'}")
+        if flag:
+            words.append(f"--{key}" if value else f"--no-{key}")
+        elif value is not None:
+            words.append(f"--{key}={value}")
+    parser.parse_args(["RAW", "OUT", *words])
+    return words

@@ -6,8 +6,6 @@ elsewhere. Shadows, light thrown back into the scene and objects moved beside th
 proposal, for a person to look at: it never trains anything unless it is accepted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -17,6 +15,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from gift_peft.files import reason
 from gift_peft.models.pixels import to_pixel_values
 
 WORKING_SIDE = 512  # pixels; a proposal is no finer, and averaging takes sensor noise out
@@ -226,9 +225,7 @@ def _sam2(method: str):
     try:
         return Sam2Model.from_pretrained(model_id).eval()
     except (OSError, ValueError) as error:
-        raise ValueError(
-            f"refine {method}: the model cannot be loaded ({str(error).strip().splitlines()[0]})"
-        ) from None
+        raise ValueError(f"refine {method}: the model cannot be loaded ({reason(error)})") from None
 
 
 def _ask_sam2(model, image: np.ndarray, labels: np.ndarray, stats: np.ndarray) -> np.ndarray:

@@ -6,13 +6,15 @@ map is a small motion, and the warped frame fits better outside the target than 
 did not move is not resampled at all.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
+from gift_peft.prepare.entries import Figures, Remark
 from gift_peft.prepare.homography import Fit, corners_of, displacement, distortion, fit_pixels, transform
-from gift_peft.prepare.matching import Frame, Matches, RegistrationSettings, find_homography, match_frames
+from gift_peft.prepare.matching import Frame, Matches, find_homography, match_frames
+from gift_peft.prepare.settings import RegistrationSettings
 
 
 @dataclass
@@ -22,18 +24,19 @@ class Registration:
     Args:
         status (`str`): "identity" (leave the pixels alone), "warped", or "dropped".
         matrix (`np.ndarray`, *optional*): (3, 3), frame to target frame, pixels; None if dropped.
-        method (`str`): "declared static", "features", "pixels", or "paper" (it leaves a treated reference alone).
-        reasons (`list[dict]`): {"code", "text"}, why it was dropped.
-        warnings (`list[dict]`): likewise, what to look at although it was not.
-        figures (`dict`): what was measured (`captures.py` lists the keys).
+        figures (`Figures`): what was measured, and by which method.
+        reasons (`list[Remark]`): why it was dropped.
+        warnings (`list[Remark]`): what to look at although it was not.
     """
 
     status: str
-    matrix: np.ndarray | None = None
-    method: str = "features"
-    reasons: list[dict] = field(default_factory=list)
-    warnings: list[dict] = field(default_factory=list)
-    figures: dict = field(default_factory=dict)
+    matrix: np.ndarray | None
+    figures: Figures
+    reasons: list[Remark] = field(default_factory=list)
+    warnings: list[Remark] = field(default_factory=list)
+
+    def __post_init__(self):
+        self.figures.homography = None if self.matrix is None else self.matrix.tolist()
 
 
 def register(moving: Frame, fixed: Frame, declared_static: bool = False, treated: bool = False) -> Registration:
@@ -44,26 +47,25 @@ def register(moving: Frame, fixed: Frame, declared_static: bool = False, treated
     """
     settings = fixed.settings
     if declared_static:
-        return Registration("identity", np.eye(3), "declared static")
+        return Registration("identity", np.eye(3), Figures("declared static"))
     tries = []
     for contrast in _contrasts(settings):
         tries.append(match_frames(moving, fixed, contrast))
         if _sure(tries[-1], fixed):
             break
-    enough = [match for match in tries if not _weak(match, fixed)]
+    enough = [match for match in tries if not _weak(match, settings)]
     best = max(enough, key=lambda match: (match.inlier_ratio >= settings.min_inlier_ratio, match.count), default=None)
     if best is None:
-        result = Registration("dropped", reasons=_diagnose(tries, fixed), figures=_figures(tries[-1], fixed))
+        result = Registration("dropped", None, _figures(tries[-1]), _diagnose(tries, fixed))
     else:
         result = _decide(best, moving, fixed, treated)
-    if result.status == "dropped" and result.reasons[0]["code"] != "moved_too_far":
+    if result.status == "dropped" and result.reasons[0].code != "moved_too_far":
         by_pixels = _identity_by_pixels(moving, fixed)
         if by_pixels is not None:
-            warnings = [reason("by_pixels", "too few matches agree; the pixels outside the target show no motion")]
-            result = Registration("identity", np.eye(3), "pixels", [], warnings, result.figures | by_pixels)
-    paper = _paper_verdict(moving, fixed)
-    result.figures["paper_exact"] = {key: value for key, value in paper.items() if key != "matrix"}
-    return _by_the_paper(paper, result, treated) if settings.paper_exact else result
+            warning = Remark("by_pixels", "too few matches agree; the pixels outside the target show no motion")
+            figures = replace(result.figures, method="pixels", **by_pixels)
+            result = Registration("identity", np.eye(3), figures, warnings=[warning])
+    return _by_the_paper(moving, fixed, result, treated) if settings.paper_exact else result
 
 
 def _decide(match: Matches, moving: Frame, fixed: Frame, treated: bool) -> Registration:
@@ -75,64 +77,48 @@ def _decide(match: Matches, moving: Frame, fixed: Frame, treated: bool) -> Regis
     moved = displacement(fit.matrix, fixed.corners)
     corner, bent = displacement(fit.matrix, frame_corners), distortion(fit.matrix, frame_corners)
     before, after = difference_outside(moving, fixed, matrix)
-    figures = _figures(match, fixed) | {
-        "expected_error": error,
-        "corner_displacement": corner,
-        "target_displacement": moved,
-        "difference_before": before,
-        "difference_after": after,
-    }
-    # A turn about a point among the features moves them little and a target far from it much. That is believed only
-    # when the pixels bear it out: the map alone moves corners of frames whose camera stood still.
+    figures = replace(
+        _figures(match),
+        expected_error=error,
+        corner_displacement=corner,
+        target_displacement=moved,
+        difference_before=before,
+        difference_after=after,
+    )
+    # A turn about a point among the features moves them little, but a target far from them much. It is believed only
+    # if the pixels confirm it, because the map alone would also move corners of frames whose camera stood still.
     hidden = moved - 2 * error > settings.identity_displacement and after < 0.97 * before
     if match.median_displacement < settings.identity_displacement and not hidden:
-        return Registration("identity", np.eye(3), figures=figures)
+        return Registration("identity", np.eye(3), figures)
     if fit is not match.fit and moved < settings.identity_displacement and _still_by(fit, match, settings):
         text = "the matches move by half a pixel or more, the pixels outside the target do not"
-        warnings = [reason("by_pixels", text)]
-        return Registration("identity", np.eye(3), "pixels", [], warnings, figures)
-    bound = settings.max_displacement * float(np.hypot(*fixed.size))
-    ratio = match.inlier_ratio
-    checks = [
-        (
-            max(corner, moved) > bound,
-            "moved_too_far",
-            f"a corner moves by {max(corner, moved):.1f} px, bound {bound:.1f}",
-        ),
-        (
-            bent > settings.max_distortion,
-            "distorted",
-            f"lengths change by {100 * bent:.1f} %, bound {100 * settings.max_distortion:.1f} %",
-        ),
-        (
-            ratio < settings.min_inlier_ratio,
-            "low_inlier_ratio",
-            f"{match.count} of {match.near.sum()} matches agree ({100 * ratio:.0f} %), "
-            f"{100 * settings.min_inlier_ratio:.0f} % needed",
-        ),
-        (
-            error > settings.max_target_error,
-            "uncertain",
-            f"the map may be {error:.2f} px off at the target's corners, bound {settings.max_target_error}",
-        ),
-        (
-            fit.correlation < settings.min_correlation,
-            "no_match",
-            f"the pictures outside the target correlate by {fit.correlation:.2f}, {settings.min_correlation} needed",
-        ),
-        (
-            not after <= before,
-            "worse_outside",
-            f"warping would raise the difference outside the target from {before:.2f} to {after:.2f}",
-        ),
-    ]
-    reasons = [reason(code, text) for failed, code, text in checks if failed]
-    warnings = []
-    if treated and fit is not match.fit and [item["code"] for item in reasons] == ["low_inlier_ratio"]:
-        warnings, reasons = reasons, []
+        figures.method = "pixels"
+        return Registration("identity", np.eye(3), figures, warnings=[Remark("by_pixels", text)])
+    bound, farthest = settings.max_displacement * float(np.hypot(*fixed.size)), max(corner, moved)
+    reasons = []
+    if farthest > bound:
+        reasons.append(Remark("moved_too_far", f"a corner moves by {farthest:.1f} px, bound {bound:.1f}"))
+    if bent > settings.max_distortion:
+        text = f"lengths change by {100 * bent:.1f} %, bound {100 * settings.max_distortion:.1f} %"
+        reasons.append(Remark("distorted", text))
+    if match.inlier_ratio < settings.min_inlier_ratio:
+        text = f"{match.count} of {match.near.sum()} matches agree ({100 * match.inlier_ratio:.0f} %)"
+        reasons.append(Remark("low_inlier_ratio", f"{text}, {100 * settings.min_inlier_ratio:.0f} % needed"))
+    if error > settings.max_target_error:
+        text = f"the map may be {error:.2f} px off at the target's corners, bound {settings.max_target_error}"
+        reasons.append(Remark("uncertain", text))
+    if fit.correlation < settings.min_correlation:
+        text = f"the pictures outside the target correlate by {fit.correlation:.2f}, {settings.min_correlation} needed"
+        reasons.append(Remark("no_match", text))
+    if not after <= before:
+        text = f"warping would raise the difference outside the target from {before:.2f} to {after:.2f}"
+        reasons.append(Remark("worse_outside", text))
+    if treated and fit is not match.fit and [item.code for item in reasons] == ["low_inlier_ratio"]:
+        figures.method = "pixels"
+        return Registration("warped", matrix, figures, warnings=reasons)
     if reasons:
-        return Registration("dropped", reasons=reasons, figures=figures)
-    return Registration("warped", matrix, "pixels" if warnings else "features", [], warnings, figures)
+        return Registration("dropped", None, figures, reasons)
+    return Registration("warped", matrix, figures)
 
 
 def _still_by(fit: Fit, match: Matches, settings: RegistrationSettings) -> bool:
@@ -142,37 +128,34 @@ def _still_by(fit: Fit, match: Matches, settings: RegistrationSettings) -> bool:
     return float(np.median(moves)) < settings.identity_displacement
 
 
-def _paper_verdict(moving: Frame, fixed: Frame) -> dict:
-    """What the paper's numbers alone say, features inside the target included."""
+def _by_the_paper(moving: Frame, fixed: Frame, ours: Registration, treated: bool) -> Registration:
+    """What the paper's numbers alone decide, features inside the target included, with our decision beside it.
+
+    The paper registers observations only; a treated reference stays as it is.
+    """
     settings = fixed.settings
     match = match_frames(moving, fixed, settings.contrast_threshold, outside_only=False)
-    accepted = match.matrix is not None and match.inlier_ratio >= settings.min_inlier_ratio
-    return {
-        "accepted": bool(accepted and abs(np.linalg.det(match.matrix)) > 1e-9),
-        "matches": int(match.near.sum()),
-        "inliers": match.count,
-        "inlier_ratio": match.inlier_ratio,
-        "corner_displacement": None if match.matrix is None else displacement(match.matrix, corners_of(*fixed.size)),
-        "matrix": match.matrix,
-    }
-
-
-def _by_the_paper(paper: dict, ours: Registration, treated: bool) -> Registration:
-    """The paper registers observations only; a treated reference stays as it is."""
-    figures = ours.figures | {"with_additions": {"status": ours.status, "reasons": ours.reasons}}
-    if treated:
-        return Registration("identity", np.eye(3), "paper", figures=figures)
-    if paper["accepted"]:
-        return Registration("warped", paper["matrix"], figures=figures)
-    ratio = paper["inlier_ratio"]
-    text = f"{paper['inliers']} of {paper['matches']} matches agree" + (
-        "" if ratio is None else f" ({100 * ratio:.0f} %)"
+    matrix, ratio, near = match.matrix, match.inlier_ratio, int(match.near.sum())
+    accepted = matrix is not None and ratio >= settings.min_inlier_ratio and abs(np.linalg.det(matrix)) > 1e-9
+    figures = replace(
+        ours.figures,
+        method="paper" if treated else "features",
+        paper_exact={
+            "accepted": bool(accepted),
+            "matches": near,
+            "inliers": match.count,
+            "inlier_ratio": ratio,
+            "corner_displacement": None if matrix is None else displacement(matrix, corners_of(*fixed.size)),
+        },
+        with_additions={"status": ours.status, "reasons": ours.reasons},
     )
-    return Registration("dropped", reasons=[reason("low_inlier_ratio", text)], figures=figures)
-
-
-def reason(code: str, text: str) -> dict:
-    return {"code": code, "text": text}
+    if treated:
+        return Registration("identity", np.eye(3), figures)
+    if accepted:
+        return Registration("warped", matrix, figures)
+    share = "" if ratio is None else f" ({100 * ratio:.0f} %)"
+    text = f"{match.count} of {near} matches agree{share}"
+    return Registration("dropped", None, figures, [Remark("low_inlier_ratio", text)])
 
 
 def _contrasts(settings: RegistrationSettings) -> list[float]:
@@ -183,38 +166,34 @@ def _contrasts(settings: RegistrationSettings) -> list[float]:
     return contrasts
 
 
-def _weak(match: Matches, fixed: Frame) -> list[dict]:
-    """Why the matches do not determine a map at all, [] if they do."""
-    settings = fixed.settings
+def _weak(match: Matches, settings: RegistrationSettings) -> Remark | None:
+    """Why the matches do not determine a map at all, None if they do."""
     if match.count < settings.min_inliers:
-        return [reason("no_match", f"{match.count} matches agree, {settings.min_inliers} needed")]
+        return Remark("no_match", f"{match.count} matches agree, {settings.min_inliers} needed")
     spread = match.spread
     if match.fit is None or spread < settings.min_spread:
-        return [
-            reason(
-                "narrow", f"the agreeing matches spread over {spread:.3f} of the frame, {settings.min_spread} needed"
-            )
-        ]
-    return []
+        text = f"the agreeing matches spread over {spread:.3f} of the frame, {settings.min_spread} needed"
+        return Remark("narrow", text)
+    return None
 
 
 def _sure(match: Matches, fixed: Frame) -> bool:
     """Whether a lower contrast threshold, with more matches, has nothing to add."""
     settings = fixed.settings
     return (
-        not _weak(match, fixed)
+        not _weak(match, settings)
         and match.inlier_ratio >= settings.min_inlier_ratio
         and match.fit.expected_error(fixed.corners) <= settings.max_target_error
     )
 
 
-def _diagnose(tries: list[Matches], fixed: Frame) -> list[dict]:
+def _diagnose(tries: list[Matches], fixed: Frame) -> list[Remark]:
     """Of matches that are all weak, the reason that helps: little texture, too large a motion, or no agreement."""
     settings = fixed.settings
     for count, which in zip(tries[-1].features, ("frame", "target frame"), strict=True):
         if count < settings.min_inliers:
             text = f"the {which} has {count} features outside the target, too little texture"
-            return [reason("featureless", f"{text}; if the camera stood still, put static_rig: true in group.yaml")]
+            return [Remark("featureless", f"{text}; if the camera stood still, put static_rig: true in group.yaml")]
     bound = settings.max_displacement * float(np.hypot(*fixed.size))
     for match in tries:
         if len(match.fixed) < 8:
@@ -223,15 +202,15 @@ def _diagnose(tries: list[Matches], fixed: Frame) -> list[dict]:
         if matrix is not None and inliers.sum() >= max(8, 0.6 * len(inliers)):
             moved = displacement(matrix, fixed.corners)
             if moved > bound:
-                return [reason("moved_too_far", f"the target moves by about {moved:.0f} px, bound {bound:.1f}")]
-    return _weak(tries[-1], fixed)
+                return [Remark("moved_too_far", f"the target moves by about {moved:.0f} px, bound {bound:.1f}")]
+    return [_weak(tries[-1], settings)]
 
 
 def _refine(match: Matches, moving: Frame, fixed: Frame) -> tuple[Fit, float]:
     """The better of the fits to the matches and, from there, to the pixels, and its error at the target's corners.
 
-    The pixels are taken where they are surer and the matches bear them out. Where they say something else, the two
-    disagree by more than either admits, and that is the error.
+    The pixels' fit is taken where its expected error is smaller and the matches agree with it. Otherwise the matches'
+    is, and the distance between the two fits counts as its error if that is larger.
     """
     by_points, by_pixels = match.fit, fit_pixels(fixed.levels, moving.levels, match.fit.matrix)
     error = by_points.expected_error(fixed.corners)
@@ -295,8 +274,8 @@ def valid_area(matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def warp(array: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """A picture (H, W, 3) uint8 linearly, anything else (masks, depth; (H, W)) by the nearest pixel.
 
-    Beyond its border a picture repeats its last pixels, a black wedge would be one more object for a network to see;
-    masks and depth have 0 there.
+    Outside its old borders a picture repeats its last pixels, because a network would see a black wedge as an object
+    of the scene; masks and depth have 0 there.
     """
     height, width = array.shape[:2]
     if array.ndim == 3:
@@ -307,19 +286,12 @@ def warp(array: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return cv2.warpPerspective(stored, matrix, (width, height), flags=cv2.INTER_NEAREST).astype(array.dtype)
 
 
-def warp_stored(array: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """An (h, w) map of another size than its frame of `size` (width, height), by the nearest pixel."""
-    scale = np.diag([array.shape[1] / size[0], array.shape[0] / size[1], 1.0])
-    scale[:2, 2] = (np.diag(scale)[:2] - 1) / 2  # pixel centres onto pixel centres
-    return warp(array, scale @ matrix @ np.linalg.inv(scale))
-
-
-def _figures(match: Matches, fixed: Frame) -> dict:
-    return {
-        "contrast_threshold": match.contrast,
-        "matches": int(match.near.sum()),
-        "inliers": match.count,
-        "inlier_ratio": match.inlier_ratio,
-        "spread": match.spread if match.count else None,
-        "median_displacement": match.median_displacement,
-    }
+def _figures(match: Matches) -> Figures:
+    return Figures(
+        contrast_threshold=match.contrast,
+        matches=int(match.near.sum()),
+        inliers=match.count,
+        inlier_ratio=match.inlier_ratio,
+        spread=match.spread if match.count else None,
+        median_displacement=match.median_displacement,
+    )

@@ -1,165 +1,94 @@
-"""The arguments of `gift-peft prepare`. Every threshold has one; a YAML file (`--config`) may state the same names,
-and the command line wins."""
+"""The settings of `gift-peft prepare`. Every field with a text is a command line option (`prepare_verb.py`)."""
 
-import argparse
-import difflib
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
-from pathlib import Path
+from dataclasses import dataclass, field
 
-import yaml
+from gift_peft.captures.foreign import Layout
 
-from gift_peft.captures.foreign import Layout, read_layout
-from gift_peft.options import OptionParser
-from gift_peft.prepare.matching import RegistrationSettings
-from gift_peft.prepare.quality import QualitySettings
+
+def _option(text: str, metavar: str = "X", least: int = 0) -> dict:
+    """The metadata of a field that is an option; `least` is the smallest number that it takes."""
+    return {"help": text, "metavar": metavar, "least": least}
+
+
+def _arg(text: str, default, **more):
+    return field(default=default, metadata=_option(text, **more))
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """Thresholds of registration. Lengths are in pixels of the photos; the first eight are the paper's."""
+
+    contrast_threshold: float = _arg("contrast below which SIFT ignores a feature", 0.08)
+    edge_threshold: float = _arg("edge response above which SIFT ignores a feature", 10.0)
+    ratio: float = _arg("Lowe's ratio test", 0.70)
+    displacement_filter: float = _arg("matches that move this much unlike the median match are removed", 20.0)
+    reprojection_threshold: float = _arg("distance up to which a match agrees with a map (MAGSAC)", 2.0)
+    confidence: float = _arg("probability with which MAGSAC finds the map", 0.9995)
+    max_iterations: int = _arg("iterations of MAGSAC", 5000, least=1)
+    min_inlier_ratio: float = _arg("share of the filtered matches that must agree with the map", 0.90)
+    paper_exact: bool = _arg(
+        "the paper's registration thresholds alone; the report says what the rest would have done", False
+    )
+    min_contrast_threshold: float = _arg("how far contrast_threshold may be halved where matches are few", 0.02)
+    target_margin: int = _arg("features and pixels this close to the target do not count", 8)
+    min_inliers: int = _arg("agreeing matches outside the target that a map needs", 20)
+    min_spread: float = _arg("least deviation of those matches in any direction, over the image diagonal", 0.02)
+    identity_displacement: float = _arg("a median displacement below this is no motion", 0.5)
+    max_target_error: float = _arg("largest expected error of the map at the target's corners", 0.5)
+    max_displacement: float = _arg("largest motion of a corner of frame or target, over the image diagonal", 0.06)
+    max_distortion: float = _arg("largest change of a local length by the map, as a fraction", 0.08)
+    min_correlation: float = _arg("least correlation of the pixels outside the target with the target frame's", 0.5)
+
+    def __post_init__(self):
+        for name in ("contrast_threshold", "min_contrast_threshold", "edge_threshold", "reprojection_threshold"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: must be positive and finite, got {getattr(self, name)}")
+        if not 0 < self.confidence < 1:
+            raise ValueError(f"confidence: must be between 0 and 1, got {self.confidence}")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations: must be at least 1, got {self.max_iterations}")
+
+
+@dataclass(frozen=True)
+class QualitySettings:
+    """Thresholds of the quality checks. `warn` leads to a line in the report, `drop` drops the frame."""
+
+    warn_sharpness: float = _arg("sharpness relative to the group's median, below which a frame is blurred", 0.35)
+    drop_sharpness: float = _arg("sharpness, below which a frame is dropped", 0.02)
+    warn_clipped: float = _arg("fraction of pixels that are nearly black, or nearly white", 0.25)
+    drop_clipped: float = _arg("the same, above which a frame is dropped", 0.95)
+    warn_outside_change: float = _arg("fraction of the pixels outside the target whose local structure changed", 0.003)
+    drop_outside_change: float = _arg("the same, above which a frame is dropped", 0.25)
+    min_outside_correlation: float = _arg(
+        "correlation outside the target with the target frame, below which it is another scene and dropped", 0.25
+    )
+    min_target_change: float = _arg(
+        "mean grey change (0-255) inside the target, below which two frames are near duplicates; a train group "
+        "without a larger change is rejected",
+        1.5,
+    )
+    warn_mask_area_low: float = _arg("fraction of the image that is target, below which a mask is small", 0.002)
+    warn_mask_area_high: float = _arg("the same, above which a mask is large", 0.8)
+    warn_mask_border: float = _arg("fraction of the image's border that is target", 0.1)
+    warn_mask_iou: float = _arg("overlap of a mask with the group's majority mask", 0.8)
+    drop_mask_iou: float = _arg("the same, below which a frame is dropped", 0.2)
 
 
 @dataclass(frozen=True)
 class PrepareSettings:
-    """Everything that decides what becomes of a group.
-
-    Args:
-        registration (`RegistrationSettings`), quality (`QualitySettings`): thresholds.
-        static_rig (`bool`): no camera moved, in any group; a `group.yaml` may say it of one.
-        propose_masks (`bool`): propose masks for groups that lack any.
-        accept_proposed_masks (`bool`): use them.
-        refine (`str`, *optional*): "sam2:<model id>", for the proposals' borders.
-        layout (`Layout`, *optional*): default: the raw tree.
-    """
+    """Everything that decides what becomes of a group; `layout` describes RAW where it is not the raw tree."""
 
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     quality: QualitySettings = field(default_factory=QualitySettings)
-    static_rig: bool = False
-    propose_masks: bool = False
-    accept_proposed_masks: bool = False
-    refine: str | None = None
-    layout: Layout | None = None
-
-
-PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
-FLAGS = {
-    "static_rig": "no camera moved in any group: nothing is warped (static_rig: true in group.yaml says it of one)",
-    "propose_masks": "propose masks for groups that lack any, into OUT/masks_proposed; they are not used",
-    "accept_proposed_masks": "use the proposed masks, which the dataset card then says",
-    "paper_exact": "the paper's registration thresholds alone; the report says what the rest would have done",
-}
-EXIT_CODES = """Exit code: 0 if every group is in OUT, 3 if some were rejected (the report says why), 1 if none could
-be made, or RAW or a configuration file is wrong, 2 for a wrong command line. Run again, it does what is left to do."""
-
-
-def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
-    """`raw`, `out`, `settings` (a `PrepareSettings`), `num_proc`, `license` and `pretty_name` from the command line.
-
-    A wrong command line ends as argparse does it (exit code 2). Raises ValueError or FileNotFoundError naming the YAML
-    file and its key.
-    """
-    parser = make_parser()
-    given = {key: value for key, value in vars(parser.parse_args(argv)).items() if value is not None}
-    config = given.pop("config", None)
-    values = {**(_read_config(Path(config)) if config else {}), **given}
-    parts = {
-        name: kind(**{f.name: values[f.name] for f in fields(kind) if f.name in values})
-        for name, kind in PARTS.items()
-    }
-    if values.get("accept_proposed_masks") or values.get("refine"):
-        values["propose_masks"] = True
-    layout = values.get("layout")
-    settings = PrepareSettings(
-        **parts,
-        **{key: values[key] for key in ("static_rig", "propose_masks", "accept_proposed_masks") if key in values},
-        refine=values.get("refine"),
-        layout=None if layout is None else read_layout(layout),
+    static_rig: bool = _arg(
+        "no camera moved in any group: nothing is warped (static_rig: true in group.yaml says it of one)", False
     )
-    return argparse.Namespace(
-        raw=values["raw"],
-        out=values["out"],
-        settings=settings,
-        num_proc=values.get("num_proc", 1),
-        license=values.get("license", "unknown"),
-        pretty_name=values.get("pretty_name"),
+    propose_masks: bool = _arg(
+        "propose masks for groups that lack any, into OUT/masks_proposed; they are not used", False
     )
-
-
-def make_parser() -> OptionParser:
-    parser = OptionParser(
-        "prepare",
-        f"From a folder of photos to a checked GIFT-I dataset: register, check, write, report.\n\n{EXIT_CODES}",
-        "gift-peft prepare photos gift-i --num-proc 4",
+    accept_proposed_masks: bool = _arg("use the proposed masks, which the dataset card then says", False)
+    refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
+    layout: Layout | None = field(
+        default=None, metadata=_option("YAML file that says where RGB and mask files lie", metavar="FILE")
     )
-    parser.add_argument("raw", metavar="RAW", help="folder of group folders; it is only read")
-    parser.add_argument("out", metavar="OUT", help="prepared folder: new, or made by this command before")
-    _add(parser, "config", metavar="FILE", help="YAML file with values for these arguments; the command line wins")
-    _add(parser, "num_proc", type=_count, metavar="N", help="processes, each with groups of its own (default: 1)")
-    _add(parser, "layout", metavar="FILE", help="YAML file that says where RGB, mask and proxy files lie")
-    _add(parser, "refine", metavar="sam2:MODEL", help="refine the proposals' borders with SAM 2")
-    _add(parser, "license", metavar="ID", help="for the dataset card, for example cc-by-4.0 (default: unknown)")
-    _add(parser, "pretty_name", metavar="NAME", help="for the dataset card (default: the name of RAW)")
-    for name, text in FLAGS.items():
-        _add(parser, name, action=argparse.BooleanOptionalAction, help=text)
-    for part, kind in PARTS.items():
-        group = parser.add_argument_group(f"thresholds of {part}", f"explained in {kind.__module__}.{kind.__name__}")
-        for f in fields(kind):
-            if f.name not in FLAGS:
-                _add(group, f.name, type=_number(type(f.default)), metavar="X", help=f"default: {f.default:g}")
-    return parser
-
-
-def _add(parser, name: str, **options) -> None:
-    parser.add_argument(f"--{name.replace('_', '-')}", dest=name, default=None, **options)
-
-
-def _raise(message: str):
-    raise ValueError(message)
-
-
-def _count(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
-    return int(text)
-
-
-def _number(kind: type):
-    def parse(text: str):
-        try:
-            value = kind(text)
-        except ValueError:
-            value = math.nan
-        if not 0 <= value < math.inf:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a {kind.__name__} of at least 0")
-        return value
-
-    return parse
-
-
-def _read_config(path: Path) -> dict:
-    """The file's values, checked by the same parser as if they stood on the command line."""
-    if not path.is_file():
-        raise FileNotFoundError(f"config: no such file: {path}")
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"config {path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(values, dict):
-        raise ValueError(f"config {path}: expected lines of the form `key: value`")
-    parser = make_parser()
-    parser.error = _raise
-    known = {action.dest for action in parser._actions if action.option_strings} - {"config", "help", "debug"}
-    argv = []
-    for key, value in values.items():
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            raise ValueError(f"config {path}: unknown key {key!r}" + (f"; did you mean {near[0]}?" if near else ""))
-        if isinstance(value, list | dict) or (key in FLAGS) != isinstance(value, bool):
-            wanted = "true or false" if key in FLAGS else "one value"
-            raise ValueError(f"config {path}: {key}: {value!r}; expected {wanted}")
-        if key in FLAGS:
-            argv.append(f"--{'' if value else 'no-'}{key.replace('_', '-')}")
-        elif value is not None:
-            argv.append(f"--{key}={value}")
-    try:
-        parsed = parser.parse_args(["RAW", "OUT", *argv])
-    except ValueError as error:
-        raise ValueError(f"config {path}: {error}") from None
-    return {key: value for key, value in vars(parsed).items() if value is not None and key not in ("raw", "out")}

@@ -32,7 +32,7 @@ def ablation_table(runs: Sequence[SavedRun]) -> Table:
     """One line per run; the best value of each column is marked.
 
     A run has collapsed if its evaluation raised the collapse alarm, or if its Other RMSE is more than twice the base's
-    at its minimum-GCE checkpoint: it agrees on nothing worth having. It is marked, and its values do not compete.
+    at its minimum-GCE checkpoint. It is marked, and its values are not compared.
 
     Args:
         runs: those of `is_ablation`.
@@ -66,7 +66,7 @@ def _values(run: SavedRun) -> dict[str, float | None]:
 
 
 def _collapsed(run: SavedRun, row: dict) -> bool:
-    # (An affine fit hides a flattened output from the errors: a constant is never worse than the reference's spread.)
+    # The alarm counts, too: after an affine fit the error of a flattened output is never above the reference's spread.
     if any(report.collapse and report.collapse["alarm"] for report in run.evaluations.values()):
         return True
     base, adapted = run.history[0].get("val_other_rmse"), row.get("val_other_rmse")

@@ -4,24 +4,25 @@ Every curve is divided by its value at step 0, the base's, and smoothed by a cen
 values stay visible behind it. Colours are Okabe and Ito's, and no two curves share colour and dashes.
 """
 
+import io
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from gift_peft.reports.figures import import_pyplot
+from gift_peft.files import write_whole
 
 # Figure 5; of Figure 6 whichever a run has.
 DYNAMICS = {"train_gce": "train GCE", "val_gce": "validation GCE", "booster_tom_rmse": "Booster ToM RMSE"}
 RETENTION = {"val_other_rmse": "GIFT-I Other RMSE", "booster_other_rmse": "Booster Other RMSE"}
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DASHES = ("-", "--", "-.", ":")
-DIVERGED = 2.0  # times the base: such runs hide the others, so these get a plot of their own
+DIVERGED = 2.0  # times the base: next to such a run the others look flat, so they get a second plot
 
 Curve = tuple[str, list[float], list[float]]
 
 
-def normalised(history: Sequence[dict], key: str) -> tuple[list[float], list[float]]:
+def normalized(history: Sequence[dict], key: str) -> tuple[list[float], list[float]]:
     """(epochs, values over the first one) of a column of metrics.jsonl; empty where it was not measured.
 
     Rows without a value are left out. Raises ValueError if the first value is 0: nothing can be relative to it.
@@ -66,13 +67,13 @@ def draw_dynamics(
 def draw_retention(
     runs: Sequence[tuple[str, list[dict]]], paths: Sequence[Path], width: int | None = None
 ) -> list[str]:
-    """Figure 6: error outside the target of all runs in one plot, and where some diverge a second one of the rest.
+    """Figure 6, a plot per dataset: the error outside the target of all runs; if some diverge, a second without them.
 
-    Arguments and result as in `draw_dynamics`; a plot per dataset.
+    Arguments and result as in `draw_dynamics`.
     """
     plots = []
     for key, title in RETENTION.items():
-        curves = [(name, *normalised(history, key)) for name, history in runs]
+        curves = [(name, *normalized(history, key)) for name, history in runs]
         curves = [curve for curve in curves if curve[1]]
         calm = [curve for curve in curves if max(curve[2]) <= DIVERGED]
         if curves:
@@ -83,7 +84,7 @@ def draw_retention(
 
 
 def _curves(history: list[dict], keys: dict[str, str]) -> list[Curve]:
-    curves = [(title, *normalised(history, key)) for key, title in keys.items()]
+    curves = [(title, *normalized(history, key)) for key, title in keys.items()]
     return [curve for curve in curves if curve[1]]
 
 
@@ -91,7 +92,7 @@ def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Pat
     if not plots:
         return []
     names = list(dict.fromkeys(name for _, curves in plots for name, _, _ in curves))
-    pyplot = import_pyplot()
+    pyplot = _import_pyplot()
     figure, axes = pyplot.subplots(
         1, len(plots), figsize=(max(4.8, 3.6 * len(plots)), 3.2), squeeze=False, layout="constrained"
     )
@@ -100,7 +101,7 @@ def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Pat
             for name, epochs, values in curves:
                 number = names.index(name)
                 style = {"color": COLORS[number % len(COLORS)], "linestyle": DASHES[number % len(DASHES)]}
-                # between few points a line is only a guess: they are marked
+                # a line between few points says little, so the points are marked
                 marker = "o" if len(values) < 10 else None
                 axis.plot(epochs, values, color=style["color"], alpha=0.25, linewidth=1, marker=marker)
                 axis.plot(
@@ -115,10 +116,22 @@ def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Pat
             axis.legend(fontsize=8, frameon=False)
             axis.spines[["top", "right"]].set_visible(False)
         for path in paths:
-            temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-            metadata = {"CreationDate": None} if path.suffix == ".pdf" else None
-            figure.savefig(temporary, dpi=150, metadata=metadata)
-            os.replace(temporary, path)
+            stream = io.BytesIO()
+            metadata = {"CreationDate": None} if path.suffix == ".pdf" else None  # the same runs give the same bytes
+            figure.savefig(stream, format=path.suffix[1:], dpi=150, metadata=metadata)
+            write_whole(path, stream.getvalue())
     finally:
         pyplot.close(figure)
     return names
+
+
+def _import_pyplot() -> Any:
+    """matplotlib.pyplot without a display; ImportError with the line that installs it."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise ImportError("this figure needs matplotlib: pip install gift-peft[plots]") from None
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    return pyplot

@@ -1,7 +1,7 @@
 """`gift-peft report RUN...`: the paper's tables and figures of one's own runs, and the adapter's model card.
 
-Reads what training and evaluation left behind. Pictures need base, adapter and data again; where one of them is gone,
-or matplotlib is not installed, the report says so and has the rest.
+Reads what training and evaluation left behind. Pictures need the base, the adapter and the data again, curves need
+matplotlib: if one of them is missing, the report says so and has the rest.
 """
 
 import filecmp
@@ -13,11 +13,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from gift_peft.adapters.folder import ADAPTER_WEIGHTS
 from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
 from gift_peft.evaluation.tables import comparison_table, group_table, protocol_note, uncertainty_table
-from gift_peft.files import write_whole
+from gift_peft.files import reason, write_whole
 from gift_peft.images import list_images
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.ablation import ablation_table, is_ablation
@@ -28,8 +29,12 @@ from gift_peft.reports.model_card import model_card
 from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_names
 from gift_peft.reports.zero_shot import checkpoint_folders, draw_zero_shot
 
-WEIGHTS = "adapter_model.safetensors"
-COMPARED_GROUPS = 40  # compare.html has one observation of that many groups at most: it has to open in a browser
+COMPARED_GROUPS = 40  # in compare.html, one observation each: a browser has to open it
+HEADINGS = {
+    "gift-i-proxy": "GIFT-I, against the treated reference",
+    "gift-i-depth": "GIFT-I, against true depth",
+    "booster": "Booster",
+}
 
 
 @dataclass
@@ -52,16 +57,13 @@ class Output:
             print(to_text(table, self.color))
 
     def figure(self, name: str, title: str, draw: Callable[..., object]) -> None:
-        """A figure as PNG and, with matplotlib, as PDF."""
-        draw(path=self.folder / f"{name}.png")
+        """A figure as PNG and as PDF."""
+        for suffix in (".png", ".pdf"):
+            draw(path=self.folder / f"{name}{suffix}")
         self.sections.append(f"![{title}]({name}.png)\n")
-        try:
-            draw(path=self.folder / f"{name}.pdf")
-        except ImportError as error:
-            self.remark(f"{name}.pdf: {error}")
 
     def remark(self, text: str) -> None:
-        """Something that is not in the report, and why."""
+        """Note what is missing in the report, and why."""
         if text not in self.remarks:
             self.remarks.append(text)
 
@@ -77,16 +79,16 @@ def run_report(
     device: str | None = None,
     color: bool = False,
 ) -> Path:
-    """`gift-peft report`: writes tables, figures, compare.html and report.md; returns their folder.
+    """Write tables, figures, compare.html and report.md of `runs`; returns their folder.
 
-    A run that has no saved evaluation is evaluated first (into `RUN/evaluation`).
+    A run without a saved evaluation is evaluated first (into `RUN/evaluation`).
 
     Args:
-        runs: folders of runs or evaluations; with `card` alone also the YAML file of a run that was not made yet.
-        out (*optional*): default `report` inside the only run, else beside the working directory's files.
+        runs: folders of runs or evaluations; with `card` alone also the YAML file of a planned run.
+        out (*optional*): default `RUN/report` of the only run, `report` here for several.
         card: also write the model card of the (only) run: True for `out`/model_card.md, or a file.
-        zero_shot: pictures for the panel of base and checkpoints, or folders of them.
-        steps: the checkpoints of that panel; default those the run was told to keep (`checkpoint_at_steps`), else all.
+        zero_shot: pictures for the figure of base and checkpoints, or folders of them.
+        steps: the checkpoints in that figure; default those of `checkpoint_at_steps`, else all.
         panels: rows of the before/after figure; 0 draws no pictures.
         device (*optional*): for the models.
         color: of the tables printed.
@@ -107,7 +109,7 @@ def run_report(
         raise ValueError(f"{planned[0].path}: not a run yet; --model-card FILE writes the card of what it will be")
     if planned:
         return _write_card(saved[0], Path("model_card.md") if card is True else Path(card))
-    if zero_shot:  # what is wrong with it is said before minutes are spent on the rest
+    if zero_shot:  # fail early on a missing picture or checkpoint
         list_images(zero_shot)
         for run in saved:
             checkpoint_folders(run, steps)
@@ -143,13 +145,13 @@ def _write_card(run: SavedRun, path: Path) -> Path:
 
 
 def _is_of_adapter(run: SavedRun, report: Report) -> bool:
-    """Whether an evaluation is of the run's adapter as it is: not scaled, and not of one with other weights."""
+    """Whether an evaluation is of the run's adapter: of these weights, at scale 1."""
     if not report.adapted or report.about.get("adapter_scale") not in (None, 1):
         return False
-    evaluated = Path(report.about.get("adapter") or "") / WEIGHTS
+    evaluated = Path(report.about.get("adapter") or "") / ADAPTER_WEIGHTS
     if run.adapter is None or not evaluated.is_file():
-        return True  # nothing to compare with: the run was moved, or is an evaluation alone
-    return filecmp.cmp(evaluated, run.adapter / WEIGHTS, shallow=False)
+        return True  # nothing to compare: the run was moved, or is an evaluation alone
+    return filecmp.cmp(evaluated, run.adapter / ADAPTER_WEIGHTS, shallow=False)
 
 
 def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> None:
@@ -168,7 +170,7 @@ def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> N
             device=device,
         )
     except (OSError, ValueError, KeyError) as error:
-        output.remark(f"tables of {run.path}, which has no evaluation and could not be evaluated: {_line(error)}")
+        output.remark(f"tables of {run.path}, which has no evaluation and could not be evaluated: {reason(error)}")
         return
     run.evaluations["evaluation"] = report
 
@@ -201,13 +203,6 @@ def _tables(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> N
         output.table("loss-weights", ablation_table(runs), show=True)
 
 
-HEADINGS = {
-    "gift-i-proxy": "GIFT-I, against the treated reference",
-    "gift-i-depth": "GIFT-I, against true depth",
-    "booster": "Booster",
-}
-
-
 def _dataset(report: Report) -> str:
     return "booster" if report.dataset == "booster" else f"gift-i-{report.reference}"
 
@@ -231,7 +226,7 @@ def _curves(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> N
         try:
             drawn = draw(histories, [output.folder / f"{name}.png", output.folder / f"{name}.pdf"])
         except (ImportError, ValueError) as error:
-            output.remark(f"{name}.png: {_line(error)}")
+            output.remark(f"{name}.png: {reason(error)}")
             continue
         if drawn:
             output.sections.append(f"## {title}\n\n![{title}]({name}.png)\n")
@@ -261,7 +256,7 @@ def _pictures(run: SavedRun, name: str, output: Output, count: int, device: str 
                 columns=("RGB", reference, "base", "GIFT"),
             )
         except (OSError, ValueError) as error:
-            output.remark(f"pictures of {run.path}: {_line(error)}")
+            output.remark(f"pictures of {run.path}: {reason(error)}")
             continue
         rows = [kept[key] for key in notable]
         output.sections.append(f"## {title}\n\n[Sliders](compare{stem}.html)\n")
@@ -271,9 +266,9 @@ def _pictures(run: SavedRun, name: str, output: Output, count: int, device: str 
 
 
 def notable_observations(report: Report, count: int) -> dict[tuple[str, str], str]:
-    """{(group, image): why}: in turn where the base errs most in the target, where it got better, and where worse.
+    """{(group, image): why} of at most `count` observations, each of another group, chosen by rule and not by hand.
 
-    Each of another group, chosen by these rules alone, so that nobody has to trust a choice of pictures.
+    In turn: the largest RMSE of the base inside the target, the largest improvement, the largest deterioration.
     """
     scored = []
     for row in report.rows:
@@ -288,12 +283,12 @@ def notable_observations(report: Report, count: int) -> dict[tuple[str, str], st
     chosen: dict[tuple[str, str], str] = {}
     groups: set[str] = set()
     while len(chosen) < count and any(rankings.values()):
-        for reason, ranking in rankings.items():
+        for why, ranking in rankings.items():
             while ranking and ranking[0][0] in groups:
                 ranking.pop(0)
             if ranking and len(chosen) < count:
                 group, image, *_ = ranking.pop(0)
-                chosen[group, image] = reason
+                chosen[group, image] = why
                 groups.add(group)
     return chosen
 
@@ -301,18 +296,11 @@ def notable_observations(report: Report, count: int) -> dict[tuple[str, str], st
 def _panels(
     run: SavedRun, report: Report, notable: dict, kept: dict[tuple[str, str], Panel], device: str | None
 ) -> Iterator[Panel]:
-    """Panels group by group, the notable ones also into `kept`; only one group is in memory."""
+    """Panels group by group, so that one group is in memory at a time; the notable ones are also put into `kept`."""
     about = report.about
     base = about.get("base") or run.arguments.get("model_name_or_path")
-    model = DepthModel.from_pretrained(
-        base,
-        about["adapter"],
-        about.get("adapter_scale"),
-        about.get("revision"),
-        about.get("size"),
-        about.get("kind"),
-        device,
-    )
+    choices = (about.get(name) for name in ("adapter_scale", "revision", "size", "kind"))
+    model = DepthModel.from_pretrained(base, about["adapter"], *choices, device)
     wanted = _wanted(report, notable)
     if not wanted:
         raise ValueError("no image has a known target to compare")
@@ -326,7 +314,7 @@ def _panels(
 
 
 def _wanted(report: Report, notable: dict) -> dict[str, list[str]]:
-    """{group: images}: of each group the image on which the base errs most, and the notable ones; largest errors."""
+    """{group: images}: the notable images, and of the groups with the largest errors the image with the largest."""
     worst: dict[str, tuple[float, str]] = {}
     for row in report.rows:
         error = value_of(row, "base", "tom", "rmse")
@@ -342,8 +330,8 @@ def _wanted(report: Report, notable: dict) -> dict[str, list[str]]:
 
 
 def _label(group_id: str, image: str, notable: dict) -> str:
-    reason = notable.get((group_id, image))
-    return f"{group_id}/{image}" + (f", {reason}" if reason else "")
+    why = notable.get((group_id, image))
+    return f"{group_id}/{image}" + (f", {why}" if why else "")
 
 
 def _group_rows(report: Report) -> Callable[[str], dict]:
@@ -375,11 +363,7 @@ def _group_panels(report, find, group_id: str, labels: dict[str, str], model: De
 def _zero_shot(
     run: SavedRun, name: str, images: Sequence[str | Path], steps: Sequence[int], output: Output, device: str | None
 ) -> None:
-    files = [output.folder / f"{name}.png", output.folder / f"{name}.pdf"]
-    try:
-        draw_zero_shot(run, images, steps, files, device)
-    except ImportError as error:
-        output.remark(f"{name}.pdf: {error}")
+    draw_zero_shot(run, images, steps, [output.folder / f"{name}.png", output.folder / f"{name}.pdf"], device)
     output.sections.append(f"## Pictures the training never saw\n\n![base and checkpoints]({name}.png)\n")
 
 
@@ -387,7 +371,3 @@ def _write_markdown(names: Sequence[str], output: Output) -> None:
     head = f"# GIFT: {', '.join(dict.fromkeys(names))}\n"
     missing = [f"Not in this report: {remark}\n" for remark in output.remarks]
     write_whole(output.folder / "report.md", "\n".join([head, *output.sections, *missing]))
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())

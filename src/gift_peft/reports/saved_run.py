@@ -1,19 +1,17 @@
-"""What lies in a folder that `gift-peft report` is given: a run, an evaluation, or a run not made yet."""
+"""What `gift-peft report` finds in a folder: a run, an evaluation, or (a YAML file) a planned run."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import yaml
-
 from gift_peft.evaluation.results import Report
-from gift_peft.reports.card_metadata import portable_name
+from gift_peft.files import portable_name, read_yaml
 
 
 @dataclass
 class SavedRun:
-    """A run as it lies on the disk.
+    """A run as it was saved.
 
     Args:
         path (`Path`): the folder or file it was read from.
@@ -52,20 +50,20 @@ class SavedRun:
 
 
 def read_run(path: str | Path) -> SavedRun:
-    """A run's folder, an evaluation's folder, or the YAML file of a run that was not made yet.
+    """A run's folder, an evaluation's folder, or the YAML file of a planned run.
 
-    Raises FileNotFoundError if it is none of them, ValueError naming a file that is damaged.
+    Raises FileNotFoundError if it is none of these, ValueError naming a damaged file.
     """
     path = Path(path)
     if path.suffix in (".yaml", ".yml") and path.is_file():
-        return SavedRun(path, _yaml(path))
+        return SavedRun(path, read_yaml(path))
     if (path / "metrics.json").is_file():
         return SavedRun(path, evaluations={path.name: Report.load(path)})
     if not ((path / "config.yaml").is_file() or (path / "metrics.jsonl").is_file()):
         raise FileNotFoundError(
             f"{path}: neither a run (config.yaml, metrics.jsonl), an evaluation (metrics.json) nor a YAML file of one"
         )
-    run = SavedRun(path, _yaml(path / "config.yaml") if (path / "config.yaml").is_file() else {})
+    run = SavedRun(path, read_yaml(path / "config.yaml") if (path / "config.yaml").is_file() else {})
     if (path / "metrics.jsonl").is_file():
         run.history = [_json(path / "metrics.jsonl", line) for line in _lines(path / "metrics.jsonl")]
         if any(not isinstance(row, dict) or "step" not in row or "epoch" not in row for row in run.history):
@@ -113,16 +111,6 @@ def _base_name(run: SavedRun) -> str:
     for report in run.evaluations.values():
         name = name or report.about.get("base") or report.about.get("predictions")
     return portable_name(str(name)) if name else run.path.resolve().name
-
-
-def _yaml(path: Path) -> dict:
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: expected lines of the form `key: value`")
-    return values
 
 
 def _lines(path: Path) -> list[str]:

@@ -8,7 +8,8 @@ import argparse
 import difflib
 import math
 import re
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Literal, get_origin
@@ -49,18 +50,37 @@ FREE_TO_CHANGE = {
 LENGTH = {"num_train_epochs", "max_steps"}
 
 
-def _arg(text: str, default=..., aliases: tuple[str, ...] = ()):
-    metadata = {"help": text, "aliases": list(aliases)}
-    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
+RANGES = (
+    (
+        ("lora_rank", "micro_batch_size", "num_train_epochs", "checkpointing_steps", "checkpoints_total_limit"),
+        lambda value: value >= 1,
+        "must be at least 1",
+    ),
+    (
+        ("lambda_c", "lambda_d", "weight_decay", "dataloader_num_workers", "eval_delay", "profile", "seed"),
+        lambda value: 0 <= value < math.inf,
+        "must be finite and not negative",
+    ),
+    (("learning_rate", "adam_epsilon"), lambda value: 0 < value < math.inf, "must be positive and finite"),
+    (("adam_beta1", "adam_beta2"), lambda value: 0 <= value < 1, "must be at least 0 and below 1"),
+    (("seed",), lambda value: value < 2**32, "must be below 2**32"),
+    (("max_steps",), lambda value: value >= 1 or value == -1, "must be at least 1, or -1"),
+    (("retain",), lambda value: value == "auto" or value >= 0, "must not be negative"),
+)
+
+
+def _arg(text: str, default=MISSING, synonym: str | None = None):
+    """A field with its help, and a second name for it on the command line."""
+    return field(default=default, metadata={"help": text, "aliases": [synonym] if synonym else []})
 
 
 @dataclass
 class GiftTrainingArguments:
     """Everything a run is told; `--help` prints the texts below. A value out of range is a ValueError naming it."""
 
-    model_name_or_path: str = _arg("the base model: hub id or folder, loaded in float32", aliases=("--base",))
-    dataset_name: str = _arg("GIFT-I: raw tree, prepared folder, parquet release or hub id", aliases=("--dataset",))
-    output_dir: str = _arg("where the run goes: adapters, checkpoints, metrics.jsonl, config.yaml", aliases=("--out",))
+    model_name_or_path: str = _arg("the base model: hub id or folder, loaded in float32", synonym="--base")
+    dataset_name: str = _arg("GIFT-I: raw tree, prepared folder, parquet release or hub id", synonym="--dataset")
+    output_dir: str = _arg("where the run goes: adapters, checkpoints, metrics.jsonl, config.yaml", synonym="--out")
     config: str | None = _arg("YAML file with values for these arguments; the command line wins", None)
     model_revision: str | None = _arg("branch, tag or commit of the base model", None)
     proxies_dir: str | None = _arg("folder of the teacher's predictions; default: DATASET/proxies", None)
@@ -83,10 +103,6 @@ class GiftTrainingArguments:
     lambda_d: float = _arg("weight of the self-distillation, Eq. 6; 0 collapses the depth", 1.0)
     micro_batch_size: int = _arg("images per forward; bounds the memory, not the gradient", 2)
     retain: str = _arg("images whose graphs are kept instead of replayed: 0 (the paper), a number, or auto", "auto")
-    snapshot_micro_batch_size: int | None = _arg(
-        "images per forward of snapshots that are replayed; default: micro_batch_size, other sizes change the bits",
-        None,
-    )
     gradient_checkpointing: bool = _arg(
         "recompute the blocks in the backward; smaller graphs, more are retained", False
     )
@@ -132,6 +148,9 @@ class GiftTrainingArguments:
     hub_private_repo: bool = _arg("make that repository private", False)
 
     def __post_init__(self):
+        for name in _names():
+            if isinstance(value := getattr(self, name), Path):
+                setattr(self, name, str(value))
         if self.mixed_precision == "fp16":
             raise ValueError("mixed_precision: fp16 would need a loss scaler around the group step; use bf16 or no")
         if str(self.retain) != "auto":
@@ -141,37 +160,10 @@ class GiftTrainingArguments:
                 raise ValueError(f"retain: expected auto or a number of images, got {self.retain!r}") from None
         if self.size is not None:
             parse_size(self.size)
-        for name in (
-            "lora_rank",
-            "micro_batch_size",
-            "num_train_epochs",
-            "checkpointing_steps",
-            "checkpoints_total_limit",
-            "snapshot_micro_batch_size",
-        ):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise ValueError(f"{name}: must be at least 1, got {value}")
-        for name in (
-            "lambda_c",
-            "lambda_d",
-            "weight_decay",
-            "dataloader_num_workers",
-            "eval_delay",
-            "profile",
-            "seed",
-        ):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: must be finite and not negative, got {getattr(self, name)}")
-        if self.retain != "auto" and self.retain < 0:
-            raise ValueError(f"retain: must not be negative, got {self.retain}")
-        for name in ("learning_rate", "adam_epsilon"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: must be positive and finite, got {getattr(self, name)}")
-        for name in ("adam_beta1", "adam_beta2"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name}: must be at least 0 and below 1, got {getattr(self, name)}")
-        if self.seed >= 2**32:
-            raise ValueError(f"seed: must be below 2**32, got {self.seed}")
+        for names, holds, text in RANGES:
+            for name in names:
+                if (value := getattr(self, name)) is not None and not holds(value):
+                    raise ValueError(f"{name}: {text}, got {value}")
         try:
             words = [word for step in self.checkpoint_at_steps for word in str(step).split(",") if word.strip()]
             self.checkpoint_at_steps = [int(word) for word in words]
@@ -180,11 +172,7 @@ class GiftTrainingArguments:
             raise ValueError(f"checkpoint_at_steps: expected numbers of updates, got {given!r}") from None
         if any(step < 1 for step in self.checkpoint_at_steps):
             raise ValueError(f"checkpoint_at_steps: must be at least 1, got {min(self.checkpoint_at_steps)}")
-        if self.snapshot_micro_batch_size is not None and self.retain == "auto":
-            raise ValueError("snapshot_micro_batch_size: give retain as a number too, or results depend on the memory")
         self._check_recipe()
-        if self.max_steps < 1 and self.max_steps != -1:
-            raise ValueError(f"max_steps: must be at least 1, or -1, got {self.max_steps}")
         if self.overwrite_output_dir and self.resume_from_checkpoint:
             raise ValueError("overwrite_output_dir and resume_from_checkpoint exclude each other")
 
@@ -206,29 +194,6 @@ class GiftTrainingArguments:
         return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
 
-def parse_arguments(argv: list[str]) -> GiftTrainingArguments:
-    """`argv` (without the program's name) over the YAML file of `--config` over the defaults.
-
-    Raises ValueError naming the argument: an unknown key (with the nearest known one), a missing one, a wrong type.
-    FileNotFoundError if the YAML file does not exist.
-    """
-    config = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    config.add_argument("--config", type=Path)
-    config.error = _raise
-    path = config.parse_known_args(argv)[0].config
-    from_file = [] if path is None else _yaml_to_argv(path)
-    parser = make_parser()
-    parser.error = _raise
-    for word in argv:
-        option = word.split("=")[0]
-        if option.startswith("--") and not parser.knows(option):
-            raise ValueError(f"unknown argument {option}{_nearest(option[2:].replace('-', '_'))}")
-    values, unknown = parser.parse_known_args([*from_file, *argv])
-    if unknown:
-        raise ValueError(f"unknown argument {unknown[0]}")
-    return GiftTrainingArguments(**vars(values))
-
-
 def make_parser() -> OptionParser:
     return OptionParser(
         "train",
@@ -245,6 +210,27 @@ def _hf_argument_parser() -> type[argparse.ArgumentParser]:
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.HfArgumentParser
+
+
+def parse_arguments(argv: Sequence[str]) -> GiftTrainingArguments:
+    """`argv` (without the program's name) over the YAML file of `--config` over the defaults.
+
+    Raises ValueError naming the argument: an unknown key (with the nearest known one), a missing one, a wrong type.
+    FileNotFoundError if the YAML file does not exist.
+    """
+    config = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    config.add_argument("--config", type=Path)
+    parser = make_parser()
+    config.error = parser.error = _raise
+    path = config.parse_known_args(argv)[0].config
+    from_file = [] if path is None else _yaml_to_argv(path)
+    for option in (word.partition("=")[0] for word in argv if word.startswith("--")):
+        if not parser.knows(option):
+            raise ValueError(f"unknown argument {option}{_nearest(option[2:].replace('-', '_'))}")
+    values, unknown = parser.parse_known_args([*from_file, *argv])
+    if unknown:
+        raise ValueError(f"unknown argument {unknown[0]}")
+    return GiftTrainingArguments(**{name: getattr(values, name) for name in _names()})
 
 
 def _raise(message: str):

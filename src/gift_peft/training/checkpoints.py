@@ -10,74 +10,176 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
+from accelerate import Accelerator
+from accelerate.utils import broadcast_object_list
+from datasets import Dataset
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from gift_peft.files import whole_folder, write_whole
+from gift_peft.adapters.folder import ADAPTER_WEIGHTS
+from gift_peft.dataset.gift_i import dataset_fingerprint
+from gift_peft.files import jsonable, reason, whole_folder, write_whole
+from gift_peft.models.identity import teacher_revision
+from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
 
 BEST = "best"
 CHECKSUMS = "checksums.json"
 OPTIMIZER = "optimizer.safetensors"
 RNG = "rng_state.safetensors"
 STATE = "trainer_state.json"
-NEEDED = {"adapter_model.safetensors", OPTIMIZER, RNG, STATE}
+NEEDED = {ADAPTER_WEIGHTS, OPTIMIZER, RNG, STATE}
 # Temporary names of a run: of what it replaces as a whole, of that inside a checkpoint, and of single files.
 TEMPORARY = re.compile(
     r"\.+(adapter|adapter-last|checkpoint-\d+)(\.tmp)?\.(tmp|old)|\.(metrics\.jsonl|config\.yaml)\.\d+\.partial"
 )
 
 
+@dataclass
+class State:
+    """Where a run stands; all of it is in `trainer_state.json`. The sums are over the groups of this epoch so far."""
+
+    step: int = 0
+    rows: list[dict] = field(default_factory=list)
+    best_step: int | None = None
+    loss: float = 0.0
+    consistency: float = 0.0
+    distillation: float = 0.0
+    gce: float = 0.0
+    num_groups: int = 0
+    num_groups_with_pair: int = 0
+
+    def add(self, loss: float, consistency: float, distillation: float, num_pairs: int) -> None:
+        """Count one group."""
+        self.loss += loss
+        self.consistency += consistency
+        self.distillation += distillation
+        self.num_groups += 1
+        if num_pairs:  # GCE leaves out groups without a pair, the loss counts them as 0
+            self.gce += consistency
+            self.num_groups_with_pair += 1
+
+    def close_epoch(self, epoch_steps: int, measured: dict) -> bool:
+        """Add a row, the means since the last one and what was measured; the sums start again.
+
+        Returns whether its validation GCE is the smallest so far, the base's apart.
+        """
+        epoch = self.step / epoch_steps
+        row: dict = {"step": self.step, "epoch": int(epoch) if epoch.is_integer() else epoch}
+        for name in ("loss", "consistency", "distillation"):
+            row[name] = getattr(self, name) / self.num_groups if self.num_groups else None
+            setattr(self, name, 0.0)
+        row["train_gce"] = self.gce / self.num_groups_with_pair if self.num_groups_with_pair else None
+        self.gce, self.num_groups, self.num_groups_with_pair = 0.0, 0, 0
+        row = jsonable(row | measured)
+        self.rows.append(row)
+        best = self.row_of(self.best_step)
+        if not self.step or row["val_gce"] is None or (best is not None and row["val_gce"] >= best["val_gce"]):
+            return False
+        self.best_step = self.step
+        return True
+
+    def row_of(self, step: int | None) -> dict | None:
+        """The row of metrics.jsonl with this step."""
+        return next((row for row in self.rows if row["step"] == step), None)
+
+
+def write_metrics(output: Path, rows: list[dict]) -> None:
+    """metrics.jsonl, whole: a resumed run drops the rows after its checkpoint."""
+    write_whole(output / "metrics.jsonl", "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+
+
 def write_checkpoint(
     output_dir: Path,
-    step: int,
+    state: State,
+    identity: dict,
     save: Callable[[Path], None],
     model: torch.nn.Module,
     optimizer: torch.optim.Optimizer,
-    state: dict,
-    best: Path | None = None,
-) -> Path:
-    """`output_dir/checkpoint-<step>`, whole or not at all.
-
-    `save(folder)` writes the adapter, `state` is JSON, `best` the best adapter's folder. OSError if writing fails.
-    """
-    target = output_dir / f"checkpoint-{step}"
+) -> None:
+    """`output_dir/checkpoint-<step>`, whole or not at all; `save(folder)` writes the adapter. OSError if it fails."""
+    target = output_dir / f"checkpoint-{state.step}"
     with disk_errors(target), whole_folder(target) as folder:
         save(folder)
         save_file(optimizer_tensors(model, optimizer), folder / OPTIMIZER)
         save_file(_rng_tensors(), folder / RNG)
-        (folder / STATE).write_text(json.dumps(state, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        if best is not None:
-            shutil.copytree(best, folder / BEST, copy_function=_link_weights)
-        sums = {str(f.relative_to(folder)): _digest(f) for f in _files(folder)}
+        content = json.dumps({"identity": identity, **asdict(state)}, indent=1, allow_nan=False)
+        (folder / STATE).write_text(content + "\n", encoding="utf-8")
+        if state.best_step:
+            shutil.copytree(output_dir / "adapter", folder / BEST, copy_function=_link_weights)
+        sums = {f.relative_to(folder).as_posix(): _digest(f) for f in _files(folder)}
         (folder / CHECKSUMS).write_text(json.dumps(sums, indent=1) + "\n", encoding="utf-8")
-    return target
 
 
-def read_checkpoint(folder: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer) -> None:
-    """Put adapter weights, optimizer state and RNG back as they were; the caller reads `read_state` itself."""
+def restore(
+    checkpoint: Path,
+    output_dir: Path,
+    identity: dict,
+    total_steps: int,
+    model: torch.nn.Module,
+    optimizer: torch.optim.Optimizer,
+    accelerator: Accelerator,
+) -> State:
+    """Weights, optimizer, RNG, progress, metrics.jsonl and the best adapter as they were at a checkpoint.
+
+    ValueError, with nothing changed, if the `run_identity` was another one or the step is past `total_steps`.
+    """
     from peft import set_peft_model_state_dict
 
-    result = set_peft_model_state_dict(model, load_file(folder / "adapter_model.safetensors"))
+    saved = json.loads((checkpoint / STATE).read_text(encoding="utf-8"))
+    try:
+        before, state = saved.pop("identity"), State(**saved)
+    except (KeyError, TypeError, AttributeError):
+        raise ValueError(f"resume_from_checkpoint: {checkpoint} is of another version of gift-peft") from None
+    _check_identity(before, identity)
+    if state.step > total_steps:
+        raise ValueError(f"resume_from_checkpoint: {checkpoint} is past the {total_steps} steps of this run")
+    result = set_peft_model_state_dict(model, load_file(checkpoint / ADAPTER_WEIGHTS))
     if result.unexpected_keys:
-        raise ValueError(f"{folder}: the adapter does not fit this model, e.g. {result.unexpected_keys[0]}")
-    load_optimizer_tensors(model, optimizer, load_file(folder / OPTIMIZER))
-    rng = load_file(folder / RNG)
+        raise ValueError(f"{checkpoint}: the adapter does not fit this model, e.g. {result.unexpected_keys[0]}")
+    load_optimizer_tensors(model, optimizer, load_file(checkpoint / OPTIMIZER))
+    rng = load_file(checkpoint / RNG)
     torch.set_rng_state(rng["cpu"])
     if "cuda" in rng and torch.cuda.is_available():
         torch.cuda.set_rng_state(rng["cuda"])
+    if accelerator.is_main_process:
+        write_metrics(output_dir, state.rows)
+        best = output_dir / "adapter"
+        if state.best_step:
+            with whole_folder(best) as folder:
+                shutil.copytree(checkpoint / BEST, folder, dirs_exist_ok=True)
+        else:
+            shutil.rmtree(best, ignore_errors=True)
+    accelerator.wait_for_everyone()
+    return state
 
 
-def read_state(folder: Path) -> dict:
-    return json.loads((folder / STATE).read_text(encoding="utf-8"))
+def run_identity(
+    args: GiftTrainingArguments, splits: Sequence[Dataset], size: tuple[int, int], accelerator: Accelerator
+) -> dict:
+    """What must be the same for a resumed run, under the names of the arguments. `splits`: train, then validation."""
+    fixed_length = args.lr_scheduler_type == "linear" or args.eval_delay
+    free = FREE_TO_CHANGE - (LENGTH if fixed_length else set())
+    fingerprint = [None]
+    if accelerator.is_main_process:
+        fingerprint = ["-".join(map(dataset_fingerprint, splits))]
+    return {
+        **{name: value for name, value in asdict(args).items() if name not in free},
+        "model_name_or_path": teacher_revision(args.model_name_or_path, args.model_revision),
+        "dataset_name": broadcast_object_list(fingerprint)[0],
+        # The fingerprint does not depend on it, the order of the updates does.
+        "group_order": hashlib.sha256("\n".join(splits[0]["group_id"]).encode()).hexdigest()[:32],
+        "size": "x".join(map(str, size)),
+        "mixed_precision": accelerator.mixed_precision,
+    }
 
 
-def check_identity(before: dict, now: dict) -> None:
+def _check_identity(before: dict, now: dict) -> None:
     """Raise ValueError naming the first argument of a run's identity that changed since the checkpoint."""
     changed = {
         "model_name_or_path": "the base model's weights have",
@@ -133,8 +235,14 @@ def checkpoint_fault(folder: Path) -> str | None:
     except FileNotFoundError as error:
         return f"{Path(error.filename).name} is missing"
     except (OSError, ValueError, AttributeError) as error:
-        return " ".join(str(error).split())
+        return reason(error)
     return None
+
+
+def last_complete(output_dir: Path) -> str:
+    """The newest complete checkpoint, as a clause for a message."""
+    complete = [folder for folder in list_checkpoints(output_dir) if not checkpoint_fault(folder)]
+    return f"the last checkpoint is {complete[-1]}" if complete else "no checkpoint had been written yet"
 
 
 def prune_checkpoints(output_dir: Path, step: int, limit: int | None, keep: list[int]) -> None:
@@ -232,48 +340,3 @@ def _link_weights(source: str, target: str) -> None:
 def _digest(path: Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@dataclass
-class State:
-    """Where a run stands; all of it is in `trainer_state.json`. The sums are over the groups of this epoch so far."""
-
-    step: int = 0
-    rows: list[dict] = field(default_factory=list)
-    best_step: int | None = None
-    loss: float = 0.0
-    consistency: float = 0.0
-    distillation: float = 0.0
-    gce: float = 0.0
-    num_groups: int = 0
-    num_groups_with_pair: int = 0
-
-    def add(self, loss: float, consistency: float, distillation: float, num_pairs: int) -> None:
-        """Count one group."""
-        self.loss += loss
-        self.consistency += consistency
-        self.distillation += distillation
-        self.num_groups += 1
-        if num_pairs:  # GCE leaves out groups without a pair, the loss counts them as 0
-            self.gce += consistency
-            self.num_groups_with_pair += 1
-
-    def close_epoch(self, epoch_steps: int) -> dict:
-        """The means since the last row, as the first half of a row; the sums start again."""
-        epoch = self.step / epoch_steps
-        row: dict = {"step": self.step, "epoch": int(epoch) if epoch.is_integer() else epoch}
-        for name in ("loss", "consistency", "distillation"):
-            row[name] = getattr(self, name) / self.num_groups if self.num_groups else None
-            setattr(self, name, 0.0)
-        row["train_gce"] = self.gce / self.num_groups_with_pair if self.num_groups_with_pair else None
-        self.gce, self.num_groups, self.num_groups_with_pair = 0.0, 0, 0
-        return row
-
-    def row_of(self, step: int | None) -> dict | None:
-        """The row of metrics.jsonl with this step."""
-        return next((row for row in self.rows if row["step"] == step), None)
-
-
-def write_metrics(output: Path, rows: list[dict]) -> None:
-    """metrics.jsonl, whole: a resumed run drops the rows after its checkpoint."""
-    write_whole(output / "metrics.jsonl", "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))

@@ -4,25 +4,22 @@ Phases are timed from outside of the step; arithmetic is counted by PyTorch on o
 rate of a large matrix multiplication, measured at the same place.
 """
 
-from __future__ import annotations
-
-import resource
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import psutil
 import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-if TYPE_CHECKING:
-    from gift_peft.dataset.tensors import Group
-    from gift_peft.group_step import GroupStep, GroupStepOutput
-    from gift_peft.training.loop import Run
+from gift_peft.dataset.loader import PreparedGroups
+from gift_peft.dataset.tensors import Group
+from gift_peft.group_step import GroupStep, GroupStepOutput
 
 PHASES = ("load", "snapshot", "loss", "replay", "reduce", "optimizer")
 
@@ -107,54 +104,58 @@ def reset_peak_memory(device: torch.device) -> None:
 
 
 def peak_memory(device: torch.device) -> int:
-    """Bytes: of tensors on CUDA, of the whole process on CPU (its largest resident set)."""
+    """Bytes: of tensors on CUDA, else of the whole process (its largest resident set; of now, where none is kept)."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
-    with suppress(OSError, StopIteration):
+    with suppress(OSError, StopIteration):  # the one that `reset_peak_memory` starts anew
         lines = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
+    try:
+        import resource  # not on Windows
+    except ImportError:
+        memory = psutil.Process().memory_info()
+        return getattr(memory, "peak_wset", memory.rss)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def profile_updates(run: Run, num_updates: int) -> str:
-    """Time `num_updates` updates of a run after one to warm up, as a table. Nothing is written; weights change."""
-    device = run.accelerator.device
-    feed = run.groups_from(0)
-    images, forwards = 0, 0
-    try:
-        timed_update(run.group_step, run.optimizer, lambda: next(feed), Phases(device))
-        reset_peak_memory(device)
-        phases = Phases(device)
-        started = time.perf_counter()
-        for _ in range(num_updates):
-            sizes: list[int] = []
+def profile_updates(
+    num_updates: int, step: GroupStep, optimizer: torch.optim.Optimizer, groups: PreparedGroups, feed: Iterator[Group]
+) -> str:
+    """Time `num_updates` updates on what `feed` gives, after one to warm up, as a table; `groups` are an epoch's.
 
-            def load(sizes=sizes) -> Group:
-                group = next(feed)
-                sizes.append(len(group.names))
-                return group
+    Nothing is written; weights change. `step` is one with an accelerator.
+    """
+    device, processes = step.accelerator.device, step.accelerator.num_processes
+    timed_update(step, optimizer, lambda: next(feed), Phases(device))
+    reset_peak_memory(device)
+    phases = Phases(device)
+    sizes = []
 
-            forwards += timed_update(run.group_step, run.optimizer, load, phases).forwards
-            images += sizes[0]
-        seconds = time.perf_counter() - started
-    finally:
-        feed.close()
+    def load() -> Group:
+        group = next(feed)
+        sizes.append(len(group.names))
+        return group
+
+    started = time.perf_counter()
+    forwards = sum(timed_update(step, optimizer, load, phases).forwards for _ in range(num_updates))
+    seconds = time.perf_counter() - started
+    images = sum(sizes)
     peak = peak_memory(device)
-    flops = count_flops(run.model, run.train_groups[0].pixel_values[: run.args.micro_batch_size])
-    dtype = torch.bfloat16 if run.accelerator.mixed_precision == "bf16" else torch.float32
-    rate = (forwards * flops.forward + images * flops.backward) / seconds / run.accelerator.num_processes
-    epoch_images = sum(map(len, run.train_groups.dataset["image_names"]))
+    flops = count_flops(step.model, groups[0].pixel_values[: step.micro_batch_size])
+    dtype = torch.bfloat16 if step.mixed_precision == "bf16" else torch.float32
+    rate = (forwards * flops.forward + images * flops.backward) / seconds / processes
+    epoch_images = sum(map(len, groups.dataset["image_names"]))
     lines = [
         f"{num_updates} updates, {images} images, {forwards} image forwards ({forwards / images:.2f} per image) "
-        f"in {seconds:.2f} s on {run.accelerator.num_processes} x {device.type}",
-        f"{images / seconds:.2f} images/s; an epoch of {run.epoch_steps} groups, {epoch_images} images: "
+        f"in {seconds:.2f} s on {processes} x {device.type}",
+        f"{images / seconds:.2f} images/s; an epoch of {len(groups)} groups, {epoch_images} images: "
         f"{epoch_images * seconds / images:.1f} s (extrapolated)",
         phase_line(phases.seconds, seconds),
         f"{rate / 1e12:.3g} TFLOP/s, {rate / matmul_rate(device, dtype):.0%} of a large {dtype} matrix product",
         f"peak memory {peak / 2**20:.0f} MiB" + ("" if device.type == "cuda" else " (the whole process)"),
     ]
-    if run.group_step.budget is not None:
-        lines.append(str(run.group_step.budget))
+    if step.budget is not None:
+        lines.append(str(step.budget))
     return "\n".join(lines)
 
 

@@ -1,11 +1,14 @@
-"""What a run says while it runs: on a terminal a bar (loss, GCE, groups/s, time left), and always a line per epoch."""
+"""What a run says: on a terminal a bar (loss, GCE, groups/s, time left), always a line per epoch, and how it ended."""
 
+import shlex
 import sys
 import time
+from pathlib import Path
 
 from tqdm import tqdm
 
 from gift_peft.evaluation.table_formats import number
+from gift_peft.evaluation.tables import relative_change
 
 
 class Progress:
@@ -57,3 +60,26 @@ class Progress:
 
     def close(self) -> None:
         self.bar.close()
+
+
+def summary(adapter: Path, rows: list[dict], best_step: int | None, validated: bool) -> str:
+    """The last lines of a run: which adapter is kept, and what it changed."""
+    row = next(row for row in reversed(rows) if best_step in (None, row["step"]))
+    lines = [f"Adapter: {adapter} (step {row['step']})"]
+    if validated and best_step is None:
+        lines.append("  In no validation group two target masks meet: it is the last adapter, chosen by nothing")
+    for title, key in (("validation GCE", "val_gce"), ("ToM RMSE", "val_tom_rmse"), ("Other RMSE", "val_other_rmse")):
+        before, after = rows[0][key], row[key]
+        if after is not None:
+            change = relative_change(before, after)
+            lines.append(f"  {title:15}{number(before)} -> {number(after)} ({change:+.1f} %)")
+    return "\n".join(lines)
+
+
+def how_to_resume(output: Path, step: int) -> str:
+    """The last lines of a run that a signal has stopped."""
+    config = output / "config.yaml"
+    return (
+        f"Stopped after step {step}; {output}/checkpoint-{step} is complete. Go on with\n"
+        f"  gift-peft train --config {shlex.quote(str(config))} --resume_from_checkpoint latest"
+    )

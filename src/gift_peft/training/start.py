@@ -18,9 +18,10 @@ from accelerate import Accelerator, PartialState
 from accelerate.state import AcceleratorState
 from accelerate.utils import ProjectConfiguration, parse_flag_from_env
 
+from gift_peft.evaluation.booster_scenes import find_booster
 from gift_peft.files import write_whole
 from gift_peft.training.arguments import GiftTrainingArguments
-from gift_peft.training.checkpoints import checkpoint_fault, find_checkpoint, list_checkpoints, remove_leftovers
+from gift_peft.training.checkpoints import find_checkpoint, last_complete, list_checkpoints, remove_leftovers
 from gift_peft.training.upload import check_push
 
 RUN_FILES = ("config.yaml", "metrics.jsonl", "adapter", "adapter-last", "logs")
@@ -47,7 +48,7 @@ def check_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Pa
     """(output folder, checkpoint to go on from or None). Changes nothing but leftovers of a killed run.
 
     Raises ValueError if the folder holds a run that the arguments neither resume nor overwrite, OSError if it cannot
-    be written.
+    be written, and either for a bad Booster root.
     """
     output = Path(args.output_dir)
     check_push(args)
@@ -72,6 +73,8 @@ def check_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Pa
     output.mkdir(parents=True, exist_ok=True)
     if not os.access(output, os.W_OK):
         raise PermissionError(f"output_dir: {output} cannot be written")
+    if args.booster_root is not None:
+        find_booster(args.booster_root)
     accelerator.wait_for_everyone()  # nobody writes before everybody has looked
     return output, checkpoint
 
@@ -121,6 +124,14 @@ def stop_signals() -> Iterator[SimpleNamespace]:
             signal.signal(signum, handler)
 
 
+def agree(signum: int, accelerator: Accelerator) -> int:
+    """The signal to stop by, if any process has received one, on all of them."""
+    if accelerator.num_processes == 1:
+        return signum
+    received = accelerator.gather(torch.tensor([signum], device=accelerator.device))
+    return int(received.max())
+
+
 class Interrupted(Exception):
     """A signal has come in the middle of a validation."""
 
@@ -134,12 +145,11 @@ def tell_lost_processes(accelerator: Accelerator, output: Path) -> Iterator[None
     try:
         yield
     except RuntimeError as error:
-        backend = isinstance(error, torch.distributed.DistError) or "gloo" in str(error)
-        if accelerator.num_processes == 1 or not backend:
+        if accelerator.num_processes == 1:
             raise
-        complete = [str(folder) for folder in list_checkpoints(output) if not checkpoint_fault(folder)]
-        last = f"the last checkpoint is {complete[-1]}" if complete else "no checkpoint had been written yet"
+        if not isinstance(error, torch.distributed.DistError) and "gloo" not in str(error):
+            raise
         raise ConnectionError(
             f"process {accelerator.process_index} has lost another process of this run, see what that one says; "
-            f"{last}; the same command with --resume_from_checkpoint latest goes on with it"
+            f"{last_complete(output)}; the same command with --resume_from_checkpoint latest goes on with it"
         ) from error

@@ -18,13 +18,15 @@ from gift_peft.dataset.proxies import (
     default_proxies_dir,
     difference,
     make_header,
+    picture_digests,
     read_header,
-    row_digests,
     write_proxies,
 )
+from gift_peft.dataset.rows import parsed
 from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import pixel_settings
+from gift_peft.rules import GroupPictures
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -74,15 +76,15 @@ def make_proxies(
     problem = None
     try:
         for split in splits or gift_i_splits(dataset_path):
-            dataset = load_gift_i(dataset_path, split)
+            dataset = parsed(load_gift_i(dataset_path, split))
             mine = range(state.process_index, len(dataset), state.num_processes)
             for index in tqdm(
                 mine, desc=f"proxies, {split}", unit="group", delay=2, disable=not state.is_main_process
             ):
                 row = dataset[index]
-                path = folder / split / f"{row['group_id']}.safetensors"
-                expected = header | row_digests(row)
-                if overwrite or not _is_current(path, expected, row["image_names"], command):
+                path = folder / split / f"{row.group_id}.safetensors"
+                expected = header | picture_digests(row)
+                if overwrite or not _is_current(path, expected, row.names, command):
                     write_proxies(path, expected, *_predict_row(model, row, batch_size))
     except (ValueError, OSError) as error:
         problem = error
@@ -100,18 +102,18 @@ def _is_current(path: Path, expected: dict, names: Sequence[str], command: str) 
     return True
 
 
-def _predict_row(model: DepthModel, row: dict, batch_size: int):
+def _predict_row(model: DepthModel, row: GroupPictures, batch_size: int):
     """(proxies (N, h, w), reference (h, w) or None) of one row; ValueError naming the image of a bad prediction."""
-    names, images = list(row["image_names"]), row["images"]
+    names, images = row.names, row.images
     proxies = model.predict(model.inputs(images), batch_size)
     reference = None
-    if row["reference"] is not None:
-        reference = model.predict(model.inputs([row["reference"]]))[0]
+    if row.reference is not None:
+        reference = model.predict(model.inputs([row.reference]))[0]
     for name, proxy in [*zip(names, proxies, strict=True), ("the reference", reference)]:
         if proxy is not None and tuple(proxy.shape) != model.size:
             raise ValueError(f"the model predicts {tuple(proxy.shape)} for images of {model.size}; they must be equal")
         if proxy is not None and not torch.isfinite(proxy).all():
-            raise ValueError(f"group {row['group_id']}, {name}: the teacher's prediction has NaN or infinite values")
+            raise ValueError(f"group {row.group_id}, {name}: the teacher's prediction has NaN or infinite values")
     return proxies, reference
 
 

@@ -4,19 +4,16 @@ The record holds no path of this machine; a local base or dataset appears by its
 (`gift_peft.reports.model_card`).
 """
 
-import functools
 import platform
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
 
-from gift_peft.reports.card_metadata import is_local, portable_name
+from gift_peft.adapters.folder import ADAPTER_FILES, versions
+from gift_peft.files import is_hub_id, portable_name
 from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 
-UPLOADED = ["adapter_model.safetensors", "adapter_config.json", "gift.json", "preprocessor_config.json", "README.md"]
-PACKAGES = ("gift-peft", "torch", "transformers", "peft", "accelerate", "datasets")
 # And all that a resumed run may not change.
 RECORDED = ("model_revision", "dataset_name", "num_train_epochs", "max_steps", "retain")
 
@@ -30,15 +27,10 @@ def run_record(args: GiftTrainingArguments, **about) -> dict:
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{platform.machine()} CPU"
     return {
         "arguments": arguments,
-        "versions": _versions(),
+        "versions": versions(),
         "device": device,
         **about,
     }
-
-
-@functools.cache
-def _versions() -> dict[str, str]:
-    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
 
 
 def check_push(args: GiftTrainingArguments) -> None:
@@ -48,7 +40,7 @@ def check_push(args: GiftTrainingArguments) -> None:
     from huggingface_hub import get_token
     from huggingface_hub.utils import validate_repo_id
 
-    if is_local(args.model_name_or_path):
+    if not is_hub_id(args.model_name_or_path):
         raise ValueError(
             "push_to_hub: model_name_or_path is a local folder, which nobody else could load; give the base's hub id"
         )
@@ -65,7 +57,7 @@ def _repository(args: GiftTrainingArguments) -> str:
 
 
 def push(folder: Path, args: GiftTrainingArguments) -> str:
-    """Upload an adapter folder (the five files of `UPLOADED`); returns the repository's id.
+    """Upload an adapter folder (its five files); returns the repository's id.
 
     OSError if that fails; the run itself is complete then, and resuming it uploads again.
     """
@@ -75,7 +67,10 @@ def push(folder: Path, args: GiftTrainingArguments) -> str:
     try:
         repository = api.create_repo(repo_id=_repository(args), private=args.hub_private_repo, exist_ok=True).repo_id
         api.upload_folder(
-            repo_id=repository, folder_path=folder, allow_patterns=UPLOADED, commit_message="GIFT adapter"
+            repo_id=repository,
+            folder_path=folder,
+            allow_patterns=sorted(ADAPTER_FILES),
+            commit_message="GIFT adapter",
         )
     except (OSError, ValueError) as error:  # HfHubHTTPError is an OSError, a malformed repository name a ValueError
         raise OSError(

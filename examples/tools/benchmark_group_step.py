@@ -1,6 +1,6 @@
 """How fast one epoch of GIFT is: pair traversal, the paper's snapshot-and-replay, the full graph, and this package.
 
-    OMP_NUM_THREADS=2 python examples/tools/benchmark_group_step.py --out model_cards
+    OMP_NUM_THREADS=2 python examples/tools/benchmark_group_step.py --out docs
 
 measures, side by side on one machine, with one loader, loss and optimizer (paper, supplement B):
   (a) pairs    naive pair traversal: an update per pair of a group

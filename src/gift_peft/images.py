@@ -56,7 +56,7 @@ def to_rgb(image: Image.Image, name: str) -> Image.Image:
         return image
     if image.has_transparency_data:
         image = image.convert("RGBA")
-        if image.getchannel("A").getextrema()[0] < 255:
+        if np.asarray(image.getchannel("A")).min() < 255:
             raise ValueError(f"{name}: the image has transparent pixels; save it as RGB without an alpha channel")
     elif image.mode.startswith(("I", "F")):
         raise ValueError(f"{name}: a 16-bit (or deeper) image, mode {image.mode}; save it with 8 bits per channel")

@@ -175,7 +175,7 @@ class _PairwiseL1(torch.autograd.Function):
         for columns in blocks:
             value, signs = _pair_sums(depth[:, columns], mask[:, columns], weight, gradient is not None)
             total += value
-            if gradient is not None:
+            if gradient is not None and signs is not None:
                 gradient[:, columns] = signs
         ctx.save_for_backward(gradient)
         num_pairs = count.triu(1).count_nonzero()

@@ -69,10 +69,8 @@ class GraphBudget:
         )
 
     def __str__(self) -> str:
-        if self.bytes is None:  # this process has had no micro-batch yet
-            return "retain auto: nothing measured yet"
         if self.bytes is None:  # a group smaller than the number of processes leaves some without an image
-            return "retain auto: no image measured in this process yet"
+            return "retain auto: nothing measured yet"
         sizes = "/".join(f"{size / 2**20:.1f}" for size in self._image_bytes.values())
         return f"retain auto: up to {self.bytes / 2**20:.0f} MiB of graphs, {sizes} MiB per image"
 

@@ -118,7 +118,7 @@ def test_hub_ids_are_pinned_by_commit(raw_tree, base_dir, tmp_path, monkeypatch)
             raise OSError(f"{repository} is not a repository\nand more lines")
         return f"/cache/models--owner--net/snapshots/{commits[revision or 'main']}/{name}"
 
-    monkeypatch.setattr("transformers.utils.cached_file", cached_file)
+    monkeypatch.setattr("transformers.utils.hub.cached_file", cached_file)
     monkeypatch.setattr(loading, "load_base", lambda base, revision: (tiny_model(), tiny_processor()))
     commits["main"] = commits["v1"] = "a" * 40
     assert teacher_id("owner/net") == "owner--net" and teacher_id("owner/net", "v1") == "owner--net@v1"

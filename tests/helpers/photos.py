@@ -6,6 +6,11 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from gift_peft.prepare.matching import Frame
+from gift_peft.prepare.settings import RegistrationSettings
+
+SETTINGS = RegistrationSettings()
+
 
 def scene(seed: int, size=(480, 640)) -> np.ndarray:
     """(H, W, 3) uint8: soft shading with shapes and patches of texture on it, as a tabletop has them."""
@@ -108,3 +113,15 @@ def entry(report, group_id):
 
 def statuses(report, group_id):
     return [frame["status"] for frame in entry(report, group_id)["frames"]]
+
+
+def frames(seed, size=(360, 480)):
+    picture, mask = scene(seed, size), target(seed, size)
+    return picture, mask, Frame(picture, mask, SETTINGS)
+
+
+def through(matrix, points):
+    """Straight-line oracle of a homography."""
+    return np.array(
+        [[(m := matrix @ np.array([x, y, 1.0]))[0] / m[2], m[1] / m[2]] for x, y in np.asarray(points, np.float64)]
+    )

@@ -1,5 +1,6 @@
 """Short training runs on the tiny tree, and what they leave on disk."""
 
+import json
 import multiprocessing
 import os
 import socket
@@ -65,3 +66,7 @@ def run_in_processes(function, count: int = 2) -> list[int]:
 def train_again(args: GiftTrainingArguments, **changes) -> TrainResult:
     """Resume from the newest checkpoint."""
     return train(GiftTrainingArguments(**{**vars(args), "resume_from_checkpoint": "latest", **changes}))
+
+
+def rows_of(out):
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]

@@ -1,10 +1,8 @@
-"""The options of `gift-peft prepare`: every field of the settings, in both spellings; help loads nothing heavy."""
+"""The options of `gift-peft prepare`: every field of the settings, with its text and its default in the help."""
 
 import ast
 import inspect
 import re
-import subprocess
-import sys
 from dataclasses import fields
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -13,31 +11,32 @@ import pytest
 
 import gift_peft.prepare
 from gift_peft.prepare.prepare import prepare_gift_i
+from gift_peft.prepare.prepare_verb import PARTS
 from gift_peft.prepare.prepare_verb import parse_arguments as parse
-from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
+from gift_peft.prepare.settings import PrepareSettings
 
 PACKAGE = Path(gift_peft.prepare.__file__).parent
-THRESHOLDS = [(part, f) for part in (RegistrationSettings, QualitySettings) for f in fields(part)]
+
+
+def settings(*argv):
+    return parse(["R", *argv, "O"]).settings
 
 
 @pytest.mark.parametrize("spell", [str, lambda name: name.replace("_", "-")])
-def test_every_field_is_an_option_in_both_spellings(tmp_path, spell):
-    for kind, part in ((RegistrationSettings, "registration"), (QualitySettings, "quality")):
+def test_every_field_is_an_option(tmp_path, spell):
+    assert settings() == PrepareSettings()
+    for part, kind in PARTS.items():
         for f in fields(kind):
+            option = f"--{spell(f.name)}"
             if isinstance(f.default, bool):
-                argv, value = [f"--{spell(f.name)}"], True
-                assert (
-                    getattr(getattr(parse(["R", "O", *argv, f"--{spell('no_' + f.name)}"]).settings, part), f.name)
-                    is False
-                )
+                assert getattr(getattr(settings(option), part), f.name) is True
+                assert settings(option, f"--{spell('no_' + f.name)}") == PrepareSettings()
             else:
-                value = type(f.default)(f.default * 2) if f.name != "confidence" else 0.5
-                argv = [f"--{spell(f.name)}", str(value)]
-            assert getattr(getattr(parse(["R", *argv, "O"]).settings, part), f.name) == value, f.name
-            assert parse(["R", "O"]).settings == PrepareSettings()
+                value = 0.5 if f.name == "confidence" else f.default * 2
+                assert settings(option, str(value)) == PrepareSettings(**{part: kind(**{f.name: value})})
     for name in ("static_rig", "propose_masks", "accept_proposed_masks"):
-        assert getattr(parse([f"--{spell(name)}", "R", "O"]).settings, name) is True
-        assert getattr(parse(["R", "O", f"--{spell('no_' + name)}"]).settings, name) is False
+        assert getattr(settings(f"--{spell(name)}"), name) is True
+        assert getattr(settings(f"--{spell(name)}", f"--{spell('no_' + name)}"), name) is False
     layout = tmp_path / "layout.yaml"
     layout.write_text("root: release")
     args = parse(["R", "O", f"--{spell('pretty_name')}=A b", "--layout", str(layout), "--refine", "sam2:x"])
@@ -50,30 +49,11 @@ def test_help_says_every_option_its_default_and_an_example(capsys):
         parse(["--help"])
     words = " ".join(capsys.readouterr().out.split())
     assert ended.value.code == 0 and "example: gift-peft prepare" in words and "--static_rig" not in words
-    for _, f in THRESHOLDS:
+    for f in (f for kind in PARTS.values() for f in fields(kind)):
         assert f.metadata["help"] in words
         assert re.search(rf"--{f.name.replace('_', '-')}[ ,]", words)
         if not isinstance(f.default, bool):
             assert f"{f.metadata['help']} (default: {f.default})" in words
-
-
-def test_help_imports_nothing_heavy():
-    # Not through the package's doorway, whose own imports are another test's.
-    script = f"""
-import resource, sys, types
-package = types.ModuleType("gift_peft")
-package.__path__ = [{str(PACKAGE.parent)!r}]
-sys.modules["gift_peft"] = package
-from gift_peft.prepare.prepare_verb import run
-try:
-    run(["--help"])
-except SystemExit:
-    print([name for name in ("torch", "transformers", "datasets", "peft", "cv2") if name in sys.modules])
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_utime)
-"""
-    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-    heavy, seconds = said.splitlines()[-2:]
-    assert heavy == "[]" and float(seconds) < 2
 
 
 def test_no_circle_among_the_modules_of_prepare():

@@ -20,6 +20,7 @@ from gift_peft.demo.run import KINDS
 from gift_peft.reports.report import run_report
 
 CARDS = Path(__file__).parents[3] / "model_cards"
+IMAGES = CARDS / "images"
 FIGURES = {"before-after": "panels", "errors": "errors", "dynamics": "dynamics", "retention": "retention"}
 WIDTH = 920
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -37,10 +38,10 @@ def main() -> None:
             first = min(name for name in names if name.startswith(kind))
             rows[names.index(first)]["images"][0].save(picture)
         folder = run_report([demo], card=CARDS / "demo_adapter.md", zero_shot=pictures)
-    reduce(demo / "before_after.png", CARDS / "demo_before_after.png")
+    reduce(demo / "before_after.png", IMAGES / "demo_before_after.png")
     for name, target in FIGURES.items():
-        reduce(folder / f"{name}.png", CARDS / f"demo_{target}.png")
-    reduce(folder / f"zero-shot-{demo.resolve().name}.png", CARDS / "demo_zero_shot.png")
+        reduce(folder / f"{name}.png", IMAGES / f"demo_{target}.png")
+    reduce(folder / f"zero-shot-{demo.resolve().name}.png", IMAGES / "demo_zero_shot.png")
     if browser := next(filter(None, map(shutil.which, BROWSERS)), None):
         with tempfile.TemporaryDirectory() as temporary:
             shot = Path(temporary) / "compare.png"
@@ -48,7 +49,7 @@ def main() -> None:
             options += ["--disable-background-networking", "--disable-component-update", "--window-size=1200,800"]
             options += [f"--user-data-dir={temporary}/profile", f"--screenshot={shot}"]
             subprocess.run([browser, *options, (folder / "compare.html").resolve().as_uri()], check=True)
-            reduce(shot, CARDS / "demo_compare.png")
+            reduce(shot, IMAGES / "demo_compare.png")
 
 
 def reduce(source: Path, target: Path) -> None:

@@ -64,7 +64,7 @@ def save_adapter(
     base = base_model_name_or_path or _base_name(model)
     hub_base = _hub_name(base, card)
     with whole_folder(folder) as temporary:
-        model.save_pretrained(temporary, selected_adapters=["default"], save_embedding_layers=False)
+        model.save_pretrained(str(temporary), selected_adapters=["default"], save_embedding_layers=False)
         config = json.loads((temporary / ADAPTER_CONFIG).read_text())
         config.update(base_model_name_or_path=base, revision=revision)
         _write_json(temporary / ADAPTER_CONFIG, config)
@@ -160,7 +160,7 @@ def read_adapter_config(adapter: str | Path) -> LoraConfig:
         _read_object(adapter, ADAPTER_CONFIG)
     where = f"adapter {adapter}: damaged {ADAPTER_CONFIG}"
     try:
-        config = PeftConfig.from_pretrained(adapter)
+        config = PeftConfig.from_pretrained(str(adapter))
     except (KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ValueError(f"{where} ({reason(error)})") from None
     except (OSError, ValueError) as error:

@@ -88,7 +88,7 @@ def _between(base: torch.Tensor, trained: torch.Tensor, scale: float) -> torch.T
     return base + scale * (trained - base)
 
 
-def _active_parts(model: nn.Module, kind: type[nn.Module], weights: str) -> Iterator[tuple[Any, str]]:
+def _active_parts(model: Any, kind: type[Any], weights: str) -> Iterator[tuple[Any, str]]:
     """(module, adapter name) of the modules of a kind that hold weights of an active adapter."""
     for module in model.modules():
         if isinstance(module, kind):

@@ -9,7 +9,7 @@ from typing import Any
 
 from huggingface_hub.errors import StrictDataclassError
 from safetensors import SafetensorError
-from transformers import PreTrainedConfig, PreTrainedModel
+from transformers import PreTrainedConfig
 
 from gift_peft.files import is_hub_id, whole_folder
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
@@ -82,9 +82,7 @@ def _read_config(config_class: type[PreTrainedConfig], path: str | Path) -> PreT
         raise ValueError(f"{path}: not the sizes of a model ({' '.join(str(error).split())})") from None
 
 
-def _convert(
-    model_class: type[PreTrainedModel], processor: Any, source: Path, folder: str | Path, config: Any
-) -> Path:
+def _convert(model_class: type[Any], processor: Any, source: Path, folder: str | Path, config: Any) -> Path:
     folder = Path(folder)
     if config is not None and not isinstance(config, PreTrainedConfig):
         config = _read_config(model_class.config_class, config)

@@ -61,7 +61,7 @@ def load_external(base: Any) -> tuple[ExternalDepth, DPTImageProcessorPil]:
     Raises ValueError naming the base where its package cannot be imported or reads no such weights, FileNotFoundError
     where there are none.
     """
-    package, name = split_external(base)
+    package, _, name = str(base).partition(":")
     try:
         return _LOADERS[package](name)
     except ImportError as error:
@@ -104,7 +104,7 @@ def _load_moge(name: str) -> tuple[ExternalDepth, DPTImageProcessorPil]:
     return ExternalDepth(model, _predict_moge, ExternalConfig("moge", metric)), _processor(do_normalize=False)
 
 
-def _predict_moge(network: nn.Module, pixel_values: torch.Tensor) -> torch.Tensor:
+def _predict_moge(network: Any, pixel_values: torch.Tensor) -> torch.Tensor:
     # Unmasked: where MoGe masks, it says infinity, and a mirror is what it may mask.
     return network.infer(pixel_values, apply_mask=False, use_fp16=False)["depth"]
 

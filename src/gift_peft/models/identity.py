@@ -37,8 +37,7 @@ def teacher_revision(base: str | Path, revision: str | None = None) -> str:
         stats = tuple((str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files)
         return f"sha256:{_digest_files(stats)}"
 
-    from transformers.utils import cached_file
-    from transformers.utils.hub import extract_commit_hash
+    from transformers.utils.hub import cached_file, extract_commit_hash
 
     check_base_name(base)
     try:

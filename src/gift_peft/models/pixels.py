@@ -93,6 +93,10 @@ def resize_images(images: Sequence[Image.Image], processor, size: tuple[int, int
     return np.stack([np.asarray(image.resize((width, height), resample)).transpose(2, 0, 1) for image in images])
 
 
+def _column(values) -> np.ndarray:
+    return np.asarray(values, np.float32)[:, None]
+
+
 def normalize_pixels(pixels: np.ndarray, processor) -> torch.Tensor:
     """(N, 3, h, w) uint8 to float32 with the processor's scale, mean and std, looked up: there are 256 values."""
     import torch
@@ -103,7 +107,7 @@ def normalize_pixels(pixels: np.ndarray, processor) -> torch.Tensor:
         levels = levels.astype(np.float64) * settings["rescale_factor"]  # float64 first, as transformers does
     table = np.repeat(levels.astype(np.float32)[None], 3, axis=0)
     if settings["image_mean"] is not None:
-        table = (table - np.float32(settings["image_mean"])[:, None]) / np.float32(settings["image_std"])[:, None]
+        table = (table - _column(settings["image_mean"])) / _column(settings["image_std"])
     values = torch.empty(pixels.shape, dtype=torch.float32)
     for planes, target in zip(pixels, values.numpy(), strict=True):
         for channel in range(3):

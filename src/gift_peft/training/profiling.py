@@ -7,7 +7,7 @@ rate of a large matrix multiplication, measured at the same place.
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -145,21 +145,16 @@ def profile_updates(
     dtype = torch.bfloat16 if step.mixed_precision == "bf16" else torch.float32
     rate = (forwards * flops.forward + images * flops.backward) / seconds / processes
     epoch_images = sum(map(len, groups.dataset["image_names"]))
+    shares = {**phases.seconds, "rest": max(0.0, seconds - sum(phases.seconds.values()))}  # checks, copies
     lines = [
         f"{num_updates} updates, {images} images, {forwards} image forwards ({forwards / images:.2f} per image) "
         f"in {seconds:.2f} s on {processes} x {device.type}",
         f"{images / seconds:.2f} images/s; an epoch of {len(groups)} groups, {epoch_images} images: "
         f"{epoch_images * seconds / images:.1f} s (extrapolated)",
-        phase_line(phases.seconds, seconds),
+        ", ".join(f"{name} {value / seconds:.1%}" for name, value in shares.items()),
         f"{rate / 1e12:.3g} TFLOP/s, {rate / matmul_rate(device, dtype):.0%} of a large {dtype} matrix product",
         f"peak memory {peak / 2**20:.0f} MiB" + ("" if device.type == "cuda" else " (the whole process)"),
     ]
     if step.budget is not None:
         lines.append(str(step.budget))
     return "\n".join(lines)
-
-
-def phase_line(phases: dict[str, float], seconds: float) -> str:
-    """Shares of the time, and what is in no phase (checks, copies)."""
-    shares: Iterable[tuple[str, float]] = {**phases, "rest": max(0.0, seconds - sum(phases.values()))}.items()
-    return ", ".join(f"{name} {value / seconds:.1%}" for name, value in shares)

@@ -115,10 +115,10 @@ def _align_image(
     prediction, reference, valid, rules: Protocol, kind: str
 ) -> tuple[np.ndarray, float, float, int, int]:
     usable = valid & known(reference)
-    inverts, given_depth = rules.inverts(kind), kind == "depth"
-    if inverts and given_depth:
-        # A depth of zero or less has no (finite) inverse: it stays out of the fit and ends up at the near end.
-        positive = prediction > np.finfo(np.float64).tiny
+    inverts = rules.inverts(kind)
+    # A depth of zero or less has no (finite) inverse: it stays out of the fit and ends up at the near end.
+    positive = prediction > np.finfo(np.float64).tiny if inverts and kind == "depth" else None
+    if positive is not None:
         usable &= positive
         prediction = np.divide(1, prediction, out=np.zeros(prediction.shape), where=positive)
     farthest = reference[usable].max() if rules.floor == "ref_max" and inverts and usable.any() else None
@@ -133,12 +133,12 @@ def _align_image(
     if rules.space == "depth":
         _tell_fit_to_depth(rules, kind, scale)
     aligned = scale * prediction + shift
-    if inverts and given_depth:
+    if positive is not None:
         aligned[~positive] = np.inf
     num_nonpositive = int(np.count_nonzero(aligned <= 0))
     num_clipped = 0
     if inverts:
-        if given_depth:
+        if positive is not None:
             num_nonpositive += int(np.count_nonzero(~positive))
         if farthest is not None:
             low = aligned < 1 / farthest

@@ -7,7 +7,7 @@ the other groups or their order.
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from tqdm import tqdm
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.alignment import align, known, resize_prediction
-from gift_peft.evaluation.booster_scenes import TOM_CLASSES, find_booster, read_ground_truth
+from gift_peft.evaluation.booster_scenes import TOM_CLASSES, BoosterScene, GroundTruth, find_booster, read_ground_truth
 from gift_peft.evaluation.fitting import DegenerateFitError
 from gift_peft.evaluation.metrics import METRICS, depth_metrics
 from gift_peft.evaluation.protocols import Protocol, get_protocol
@@ -32,7 +32,6 @@ from gift_peft.evaluation.samples import (
     booster_sample,
     gift_i_sample,
     predict_scene,
-    stored_scene,
 )
 from gift_peft.evaluation.stored_predictions import PredictionFolder
 from gift_peft.losses import GeometryConsistencyError, prediction_spread
@@ -99,7 +98,7 @@ def evaluate_gift_i(
         dataset = load_gift_i(dataset, "validation")
     if size is None and not isinstance(model, DepthModel):
         size = _proxies_size(dataset)
-    model = DepthModel.of(model, teacher=teacher, processor=processor, size=size, kind=kind)
+    depth_model = DepthModel.of(model, teacher=teacher, processor=processor, size=size, kind=kind)
     rules = replace(get_protocol(protocol or REFERENCES[reference]), resolution=1.0)  # on the reference's own grid
     if reference == "proxy" and rules.space != "native":
         raise ValueError(
@@ -107,16 +106,16 @@ def evaluate_gift_i(
             'reference="depth"'
         )
     # Against proxies nothing is ever inverted, so a callable without a recipe need not say what it predicts.
-    kind = model.kind or "depth" if reference == "proxy" else model.known_kind()
+    kind = depth_model.kind or "depth" if reference == "proxy" else depth_model.known_kind()
     if reference == "depth" and rules.space == "native" and kind == "inverse_depth":
         raise ValueError(f'protocol {rules.name} would fit inverse depth straight to depth; use "gift"')
-    predictors = _predictors(model, baseline, batch_size)
+    predictors = _predictors(depth_model, baseline, batch_size)
     models = [*predictors, *(["consensus"] if "base" in predictors else [])]
-    scale = prediction_scale or (1.0 if rules.fits_scale else model.millimeters_per_unit)
+    scale = prediction_scale or (1.0 if rules.fits_scale else depth_model.millimeters_per_unit)
     task = Task(models, rules, kind, scale, NO_PROXY if reference == "proxy" else NO_DEPTH)
 
     def read(index: int) -> Sample:
-        return gift_i_sample(dataset[index], model, predictors, reference, "consensus" in models)
+        return gift_i_sample(dataset[index], depth_model, predictors, reference, "consensus" in models)
 
     groups, rows = _evaluate(len(dataset), read, task, accelerator, progress, "group")
     if not rows:
@@ -186,29 +185,35 @@ def evaluate_booster(
     if rules.resolution not in (None, resize):
         warnings.warn(f"protocol {rules.name} is meant for x{rules.resolution:g}, not x{resize:g}", stacklevel=2)
     rules = replace(rules, resolution=resize)
-    if predictions is None:
-        model = DepthModel.of(model, teacher=teacher, processor=processor, size=size, kind=kind)
-        kind = model.known_kind()
-    else:
-        kind = _stored_kind(kind, rules)
     booster = find_booster(root, subset, official)
     if predictions is None:
-        predictors = _predictors(model, baseline, batch_size)
-        scale = prediction_scale or (1.0 if rules.fits_scale else model.millimeters_per_unit)
+        depth_model = DepthModel.of(model, teacher=teacher, processor=processor, size=size, kind=kind)
+        kind = depth_model.known_kind()
+        predictors = _predictors(depth_model, baseline, batch_size)
+        models = [*predictors]
+        scale = prediction_scale or (1.0 if rules.fits_scale else depth_model.millimeters_per_unit)
+
+        def predict(scene: BoosterScene, truth: GroundTruth) -> Iterable[dict[str, Any]]:
+            return predict_scene(scene, truth, depth_model, predictors)
+
     else:
+        kind = _stored_kind(kind, rules)
         stored = PredictionFolder(predictions, prediction_scale)
         stored.check(booster.scenes, needs_scale=not rules.fits_scale)
-        predictors, scale = {"base": None}, 1.0
-    task = Task([*predictors], rules, kind, scale, NO_DEPTH)
+        models, scale = ["base"], 1.0  # the folder has scaled what it reads
+
+        def predict(scene: BoosterScene, truth: GroundTruth) -> Iterable[dict[str, Any]]:
+            return ({"base": stored.read(scene, image)} for image in scene.images)
+
+    task = Task(models, rules, kind, scale, NO_DEPTH)
 
     def read(index: int) -> Sample:
         scene = booster.scenes[index]
         truth = read_ground_truth(scene, resize, occlusion, tom_classes)
-        own = stored_scene(scene, stored) if predictions else predict_scene(scene, truth, model, predictors)
-        return booster_sample(scene, truth, own)
+        return booster_sample(scene, truth, predict(scene, truth))
 
     groups, rows = _evaluate(len(booster.scenes), read, task, accelerator, progress, "scene")
-    report = make_report("booster", groups, rows, task.models, rules, "depth")
+    report = make_report("booster", groups, rows, models, rules, "depth")
     report.about = {
         "root": str(root),
         "subset": booster.subset,
@@ -323,7 +328,7 @@ class Scorer:
         task = self.task
         nothing = {"scale": float("nan"), "shift": float("nan"), "num_clipped": 0, "num_nonpositive": 0}
         nothing |= {region: dict.fromkeys(METRICS, float("nan")) for region in REGIONS}
-        if self.pixels["all"] < 2:
+        if self.reference is None or self.pixels["all"] < 2:
             return nothing, task.missing
         prediction = resize_prediction(prediction, self.reference.shape)
         if task.prediction_scale != 1:
@@ -364,4 +369,8 @@ def _on_one_grid(
     mask = torch.from_numpy(np.stack([resize_mask(mask, shape) for mask in masks]))
     if valids[0] is None:
         return depth, mask, None
-    return depth, mask, torch.from_numpy(np.stack([resize_mask(valid, shape) for valid in valids]))
+    return (
+        depth,
+        mask,
+        torch.from_numpy(np.stack([resize_mask(valid, shape) for valid in valids if valid is not None])),
+    )

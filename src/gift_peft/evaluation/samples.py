@@ -14,7 +14,6 @@ import torch
 
 from gift_peft.dataset.tensors import Group, collate_group
 from gift_peft.evaluation.booster_scenes import BoosterScene, GroundTruth
-from gift_peft.evaluation.stored_predictions import PredictionFolder
 from gift_peft.images import read_image
 from gift_peft.losses import require_finite
 from gift_peft.models.loading import DepthModel
@@ -157,11 +156,6 @@ def predict_scene(
     pixels = torch.cat([model.inputs([_read_image(path, truth)]) for path in scene.images])
     maps = _predict(predictors, pixels, f"scene {scene.name}", [path.name for path in scene.images])
     return (dict(zip(maps, depths, strict=True)) for depths in zip(*maps.values(), strict=True))
-
-
-def stored_scene(scene: BoosterScene, stored: PredictionFolder) -> Iterator[dict[str, np.ndarray]]:
-    """Predictions of a scene's images as they are stored, read one at a time."""
-    return ({"base": stored.read(scene, image)} for image in scene.images)
 
 
 def _read_image(path, truth: GroundTruth):

@@ -64,7 +64,7 @@ def consensus_teaches(report: Report) -> bool | None:
 
 def report_tables(report: Report) -> list[Table]:
     """Metrics per region, and what has one number per model (GCE; RMSE per surface kind), with the notes."""
-    rows = []
+    rows: list[list[str | Cell] | None] = []
     for region in REGIONS:
         lines = _block(report, region)
         rows += [[REGION_NAMES[region] if i == 0 else "", label, *cells] for i, (label, cells) in enumerate(lines)]
@@ -142,14 +142,14 @@ def _change(base: dict, adapted: dict, region: str, metric: str) -> Cell:
     return change_cell(change, improved(metric, change))
 
 
-def _pair(label: str, base: float | None, adapted: float | None, consensus: float | None = None) -> list:
+def _pair(label: str, base: float | None, adapted: float | None, consensus: float | None = None) -> list[str | Cell]:
     return [label, *_compared([base, adapted]), value_cell(consensus)]
 
 
-def _pairs(report: Report) -> list[list]:
+def _pairs(report: Report) -> list[list[str | Cell] | None]:
     """Lines of what has one number per model."""
     gce, name = report.gce, report.gce_name
-    pairs = [_pair(f"{name} ↓", gce["base"], gce["adapted"])]
+    pairs: list[list[str | Cell] | None] = [_pair(f"{name} ↓", gce["base"], gce["adapted"])]
     pairs.append(_pair(f"{name} normalised ↓", gce["base_normalized"], gce["adapted_normalized"]))
     for surface, entry in report.by_surface.items():
         models = (entry["base"], entry["summary"] if report.adapted else None, entry["consensus"])
@@ -210,7 +210,7 @@ def uncertainty_table(report: Report) -> Table:
                 estimate_cell(value_cell(summaries[model][region][metric]), bootstrap.interval(model, region, metric))
                 for model in models
             ]
-            if len(models) == 2:
+            if report.base and len(models) == 2:
                 change = _change(report.base, report.summary, region, metric)
                 cells.append(estimate_cell(change, bootstrap.change_interval(region, metric)))
             cells += [value_cell(median_of(report.rows, model, region, metric)) for model in models]
@@ -243,7 +243,7 @@ def group_table(report: Report) -> Table:
     return Table(f"{_title(report)}, per {noun}", [noun, "surface", "images"], columns * 3, rows, spans, notes(report))
 
 
-def _compared(values: list[float | None]) -> list[Cell]:
+def _compared(values: Sequence[float | None]) -> list[Cell]:
     """The models' values of an error, and where there are two its change."""
     cells = [value_cell(value) for value in values]
     if len(values) == 2:

@@ -56,6 +56,8 @@ def run_evaluation(
     )
     if booster:
         report = evaluate_booster(booster, model, predictions, kind if model is None else None, **options)
+    elif dataset is None:
+        raise ValueError("an evaluation needs a dataset, or the root of Booster")
     else:
         groups = load_gift_i(dataset, split, dataset_revision=dataset_revision)
         report = evaluate_gift_i(groups, model, **options)

@@ -207,18 +207,18 @@ class DepthModel:
             if image.dtype != np.uint8:
                 raise ValueError(f"{name}: (H,W,3) uint8 is expected, not {image.dtype}")
             image = Image.fromarray(image)
-        image = read_image(image, name)
+        picture = read_image(image, name)
         post_process, options = self.processor.post_process_depth_estimation, {}
         if focal_length is not None:
             if "focal_lengths" not in inspect.signature(post_process).parameters:
                 raise ValueError(f"focal_length: {type(self.processor).__name__} takes none")
             options["focal_lengths"] = [focal_length]
-        output = self._forward(self.inputs([image]), base)
+        output = self._forward(self.inputs([picture]), base)
         if isinstance(output, torch.Tensor):
             output = SimpleNamespace(predicted_depth=output)
         if not torch.isfinite(output.predicted_depth).all():
             raise ValueError(f"{name}: the prediction has NaN or infinite values")
-        (depth,) = post_process(output, target_sizes=[(image.height, image.width)], **options)
+        (depth,) = post_process(output, target_sizes=[(picture.height, picture.width)], **options)
         return depth["predicted_depth"].float().cpu().numpy()
 
     def _predict(self, pixel_values: torch.Tensor, batch_size: int, base: bool) -> torch.Tensor:

@@ -5,13 +5,18 @@ import shutil
 import pytest
 import torch
 from helpers.runs import arguments, rows_of, train_again
-from helpers.tiny import write_group
+from helpers.tiny import write_group, write_raw_tree
 from safetensors import SafetensorError
 
 from gift_peft.training import checkpoints, loop, start, train
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
 pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return write_raw_tree(tmp_path_factory.mktemp("tree") / "raw", train=(2, 3, 2))
 
 
 def test_accelerates_fp16_is_refused(base_dir, tree, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gift_peft.surface_targets import align_observations, plane_surface, quantile_surface, surface_target
+from gift_peft.surface_targets import align_observations, paint_fills, plane_surface, quantile_surface, surface_target
 
 H, W = 24, 32
 ROWS, COLUMNS = np.mgrid[:H, :W]
@@ -289,3 +289,53 @@ def test_what_is_refused():
             surface_target(values, mask, **options)
     with pytest.raises(ValueError, match="every mask is empty"):
         surface_target(values, ~(mask | True))
+
+
+# ---- fills ----
+
+
+def test_fills_are_plain_inside_and_the_photo_outside():
+    rng = np.random.default_rng(11)
+    photo = rng.integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    mask = np.zeros((60, 80), bool)
+    mask[10:50, 20:70] = True
+    fills = list(paint_fills(photo, mask, 5, seed=3))
+    inner = np.zeros_like(mask)
+    inner[13:47, 23:67] = True
+    for fill in fills:
+        assert fill.dtype == np.uint8
+        np.testing.assert_array_equal(fill[~mask], photo[~mask])
+        assert len(np.unique(fill[inner].reshape(-1, 3), axis=0)) == 1
+        color = fill[30, 40].astype(int)
+        assert np.ptp(color) <= 77 and color.max() <= 230  # mostly grey
+        edge = np.abs(fill[10, 20:70].astype(int) - photo[10, 20:70]).max(0)
+        assert (edge < np.abs(color - photo[10, 20:70].astype(int)).max(0)).all()  # fades in
+    assert len({fill[30, 40].tobytes() for fill in fills}) == 5
+
+
+def test_fills_depend_on_seed_and_photo_alone():
+    rng = np.random.default_rng(12)
+    photo = rng.integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    mask = np.zeros((20, 30), bool)
+    mask[5:15, 5:25] = True
+    first = list(paint_fills(photo, mask, 3, seed=0))
+    for again, once in zip(paint_fills(photo.copy(), mask, 2, seed=0), first, strict=False):
+        np.testing.assert_array_equal(again, once)
+    assert not np.array_equal(next(paint_fills(photo, mask, 1, seed=1))[10, 15], first[0][10, 15])
+    other = photo.copy()
+    other[0, 0] ^= 255
+    assert not np.array_equal(next(paint_fills(other, mask, 1))[10, 15], first[0][10, 15])
+    assert not list(paint_fills(photo, mask, 0))
+
+
+def test_fills_that_are_refused():
+    photo, mask = np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), bool)
+    for arguments, message in (
+        ((photo[..., 0], mask, 1), r"uint8 \(4, 5\)"),
+        ((photo.astype(float), mask, 1), "float64"),
+        ((photo, mask.astype(int), 1), "int64"),
+        ((photo, mask[1:], 1), r"\(3, 5\)"),
+        ((photo, mask, -1), "at least 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            list(paint_fills(*arguments))

@@ -10,7 +10,8 @@ Everything here is a pure function, computed in float64: numpy in, numpy out; to
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 MODELS = ("auto", "plane", "quantile")
 KINDS = ("depth", "inverse_depth")
+SURFACES = (None, "mirror", "transparent")
 MIN_PIXELS = 16  # of a component's outline, for a plane; three parameters from fewer say nothing
 MIN_COMMON = 64  # pixels outside every mask, for a scale and a shift
 OUTLIER = 5  # times the median distance from the group: something else is there, for the alignment
@@ -30,6 +32,8 @@ SMOOTHING = 1e-4  # of the component's spread: residuals below it count as none
 CONVERGED = 1e-6  # of the component's spread: a plane that moves less has been found
 MAX_ROUNDS = 200
 MAX_ALIGN_ROUNDS = 50
+EDGE = 0.01  # of the shorter side: where paint fades in
+GREY, TINT = 0.6, 0.3  # a fill's grey and what each channel adds to it, at most, of full brightness
 PLANE_RATIO = 1.0  # "auto" takes the plane where it misses the nearer observations by less than this disagreement
 
 
@@ -155,11 +159,8 @@ def surface_target(
         ValueError: shapes that differ, NaN or infinity in a valid pixel, every mask empty, an unknown kind, model or
             surface.
     """
-    for name, value, known in (
-        ("kind", kind, KINDS),
-        ("model", model, MODELS),
-        ("surface", surface, (None, "mirror", "transparent")),
-    ):
+    choices = (("kind", kind, KINDS), ("model", model, MODELS), ("surface", surface, SURFACES))
+    for name, value, known in choices:
         if value not in known:
             raise ValueError(f"{name} {value!r}: it is one of {', '.join(map(str, known))}")
     _check_share("quantile", quantile, closed=True)
@@ -201,6 +202,40 @@ def surface_target(
     return SurfaceTarget(restore(target), models, residuals, disagreements)
 
 
+# ---- fills ----
+
+
+def paint_fills(image: np.ndarray, mask: np.ndarray, count: int, seed: int = 0) -> Iterator[np.ndarray]:
+    """The photo with its target painted in one plain, mostly grey color: `count` copies in other colors.
+
+    The colors depend on the seed and the photo alone. Paint fades in over 1 % of the shorter side inwards, so that no
+    hard edge stands where the mask may be a pixel off; outside of the mask every byte stays.
+
+    Args:
+        image: (H,W,3) uint8. mask: (H,W) bool.
+
+    Raises:
+        ValueError: another shape or type, a negative count.
+    """
+    import cv2
+
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"the photo is {image.dtype} {image.shape}; it is uint8 (H,W,3)")
+    if mask.dtype != bool or mask.shape != image.shape[:2]:
+        raise ValueError(f"the mask is {mask.dtype} {mask.shape}; it is bool {image.shape[:2]}")
+    if count < 0:
+        raise ValueError(f"fills: at least 0, got {count}")
+    content = hashlib.blake2b(np.ascontiguousarray(image), digest_size=8).digest()
+    colors = np.random.default_rng((seed, int.from_bytes(content, "little")))
+    edge = max(1.0, EDGE * min(mask.shape))
+    depth_inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    paint = np.clip(depth_inside / (edge + 1), 0, 1)[..., None] * mask[..., None]
+    for _ in range(count):
+        color = 255 * np.clip(colors.uniform(0, GREY) + colors.uniform(0, TINT, 3), 0, 1)
+        painted = np.round(image * (1 - paint) + color * paint).astype(np.uint8)
+        yield np.where(mask[..., None], painted, image)
+
+
 # ---- the models ----
 
 
@@ -221,11 +256,9 @@ def _plane(
 ) -> np.ndarray | None:
     """The plane at the pixels of the component, or None where none can be trusted."""
     index, rows, columns = np.nonzero(inside)
-    if np.count_nonzero(component) < MIN_PIXELS or not len(index):
-        return None
     y = values[index, rows, columns]
     spread = _spread(y)
-    if not spread:
+    if np.count_nonzero(component) < MIN_PIXELS or not spread:
         return None
     # Centered and scaled, so that the normal equations are as good as they can be.
     center, size = (rows.mean(), columns.mean()), max(np.ptp(rows), np.ptp(columns)) / 2
@@ -327,11 +360,8 @@ def _with_fills(
     more = [np.repeat(array, count, axis=0) for array in (inside, there)]
     if not np.isfinite(painted[more[1]]).all():
         raise ValueError("NaN or infinite values in the predictions of the fills")
-    return (
-        np.concatenate([values, painted]),
-        np.concatenate([inside, more[0]]),
-        np.concatenate([there, more[1]]),
-    )
+    pairs = ((values, painted), (inside, more[0]), (there, more[1]))
+    return tuple(np.concatenate(pair) for pair in pairs)
 
 
 def _arrays(
@@ -350,19 +380,15 @@ def _arrays(
     for number, (own, there) in enumerate(zip(array, region, strict=True)):
         if not np.isfinite(own[there]).all():
             raise ValueError(f"NaN or infinite values in the prediction of observation {number}")
-    return array, inside, _restorer(values)
+    if isinstance(values, np.ndarray):
+        return array, inside, lambda result: result
+    import torch
+
+    return array, inside, lambda result: torch.from_numpy(np.ascontiguousarray(result)).to(values.device)
 
 
 def _numpy(array: Array) -> np.ndarray:
     return array if isinstance(array, np.ndarray) else array.detach().cpu().numpy()
-
-
-def _restorer(like: Array) -> Callable[[np.ndarray], Any]:
-    if isinstance(like, np.ndarray):
-        return lambda result: result
-    import torch
-
-    return lambda result: torch.from_numpy(np.ascontiguousarray(result)).to(like.device)
 
 
 def _spread(values: np.ndarray) -> float:

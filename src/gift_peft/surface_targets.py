@@ -31,7 +31,6 @@ OUTLIER = 5  # times the median distance from the group: something else is there
 SMOOTHING = 1e-4  # of the component's spread: residuals below it count as none
 CONVERGED = 1e-6  # of the component's spread: a plane that moves less has been found
 MAX_ROUNDS = 200
-MAX_ALIGN_ROUNDS = 50
 EDGE = 0.01  # of the shorter side: where paint fades in
 GREY, TINT = 0.6, 0.3  # a fill's grey and what each channel adds to it, at most, of full brightness
 PLANE_RATIO = 1.0  # "auto" takes the plane where it misses the nearer observations by less than this disagreement
@@ -266,7 +265,7 @@ def _plane(
     if np.linalg.eigvalsh(np.cov(u, v))[0] < 1e-6:
         return None  # a line of pixels carries any plane
     base = np.median(y)
-    solution = _pinball(u, v, (y - base) / spread, tau)
+    solution = _pinball(np.stack([np.ones_like(u), u, v]), (y - base) / spread, tau)
     rows, columns = np.nonzero(component)
     design = (np.ones(len(rows)), (columns - center[1]) / size, (rows - center[0]) / size)
     plane = base + spread * sum(weight * column for weight, column in zip(solution, design, strict=True))
@@ -277,15 +276,13 @@ def _plane(
     return None if positive and plane.min() <= 0 else plane
 
 
-def _pinball(u: np.ndarray, v: np.ndarray, y: np.ndarray, tau: float) -> np.ndarray:
-    """(3,): a, b, c that minimise sum rho_tau(y - a - b u - c v); y has spread 1."""
-    design = np.stack([np.ones_like(u), u, v])
-    solution = np.array([0.0, 0.0, 0.0])
-    weights = np.ones_like(y)
+def _pinball(design: np.ndarray, y: np.ndarray, tau: float) -> np.ndarray:
+    """(K,) weights of the K rows of `design` that minimise sum rho_tau(y - weights @ design); y has spread 1."""
+    solution, weights = np.zeros(len(design)), np.ones_like(y)
     for _ in range(MAX_ROUNDS):
         weighted = design * weights
         new = np.linalg.lstsq(weighted @ design.T, weighted @ y, rcond=None)[0]
-        moved = np.abs(new - solution).sum()  # bounds the change at every pixel: |u|, |v| are at most about 1
+        moved = np.abs(new - solution).sum()  # bounds the change at every pixel: the design is at most about 1
         solution = new
         if moved < CONVERGED:
             break
@@ -296,10 +293,9 @@ def _pinball(u: np.ndarray, v: np.ndarray, y: np.ndarray, tau: float) -> np.ndar
 
 def _scale_and_shift(values: np.ndarray, common: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N,) each: what brings every observation to the group on the common pixels."""
-    scale, shift = np.ones(len(values)), np.zeros(len(values))
-    if len(values) < 2 or np.count_nonzero(common) < MIN_COMMON:
+    scale, shift, pixels = np.ones(len(values)), np.zeros(len(values)), values[:, common]
+    if len(values) < 2 or pixels.shape[1] < MIN_COMMON:
         return scale, shift
-    pixels = values[:, common]
     middle = np.median(pixels, axis=1)
     size = np.median(np.abs(pixels - middle[:, None]), axis=1)
     if not (size > 0).all():
@@ -321,18 +317,9 @@ def _least_absolute(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     spread, middle, size = _spread(y), np.median(x), _spread(x)
     if not spread or not size:
         return 1.0, 0.0
-    design = np.stack([np.ones_like(x), (x - middle) / size])
-    solution, weights = np.zeros(2), np.ones_like(y)
-    for _ in range(MAX_ALIGN_ROUNDS):
-        weighted = design * weights
-        new = np.linalg.lstsq(weighted @ design.T, weighted @ (y / spread), rcond=None)[0]
-        moved = np.abs(new - solution).sum()
-        solution = new
-        if moved < CONVERGED:
-            break
-        weights = 1 / np.maximum(np.abs(y / spread - solution @ design), SMOOTHING)
-    slope = solution[1] * spread / size
-    return float(slope), float(solution[0] * spread - slope * middle)
+    offset, slope = _pinball(np.stack([np.ones_like(x), (x - middle) / size]), y / spread, 0.5)
+    slope *= spread / size
+    return float(slope), float(offset * spread - slope * middle)
 
 
 def _components(union: np.ndarray) -> list[np.ndarray]:

@@ -64,7 +64,7 @@ class GroupPictures:
         if self.reference is not None:
             self._check_size("reference", self.reference.size[::-1], pictures[0])
 
-    def _check_size(self, part: str, shape: tuple[int, ...], size: tuple[int, int]) -> None:
+    def _check_size(self, part: str, shape: tuple[int, ...], size: tuple[int, ...]) -> None:
         if tuple(shape) != size:
             raise ValueError(
                 f"group {self.group_id}: the {part} is {shape[0]}x{shape[1]} (height x width), "

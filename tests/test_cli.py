@@ -13,7 +13,7 @@ from helpers.tiny import write_raw_tree
 import gift_peft
 from gift_peft import cli, evaluate_booster
 from gift_peft.evaluation.protocols import PROTOCOLS
-from gift_peft.evaluation.results import load_report
+from gift_peft.evaluation.results import Report
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
 pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
@@ -184,13 +184,13 @@ def test_evaluate_on_booster(trained, base_dir, tmp_path, run):
     adapter = ["--base", base_dir, "--adapter", trained / "adapter"]
     code, printed, _ = run("evaluate", "--booster", tmp_path, *adapter, "--resize", 1, "--occlusion", "noc", *out)
     assert code == 0 and "Booster balanced: 2 scenes, 4 images (mm)" in printed and "resolution x1" in printed
-    report = load_report(tmp_path / "e")
+    report = Report.load(tmp_path / "e")
     assert report.adapted and report.about["occlusion"] == "noc" and report.about["adapter"].endswith("adapter")
     assert (tmp_path / "e" / "report.md").is_file()
     stored = ["--predictions", tmp_path / "pred", "--protocol", "depth4tom"]
     code, printed, _ = run("evaluate", "--booster", tmp_path, *stored, *out)
     assert code == 0 and "Protocol depth4tom" in printed
-    assert load_report(tmp_path / "e").summary == evaluate_booster(
+    assert Report.load(tmp_path / "e").summary == evaluate_booster(
         tmp_path, predictions=tmp_path / "pred", protocol="depth4tom", progress=False
     ).summary  # fmt: skip
     (tmp_path / "pred" / "Scene1" / "camera_00" / "im1.npy").unlink()

@@ -22,7 +22,7 @@ from helpers.group_tools import (
 from helpers.tiny import tiny_model, tiny_processor, write_raw_tree
 
 from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
+from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.group_step import GroupStep
 from gift_peft.training.teacher import make_proxies
 

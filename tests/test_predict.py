@@ -16,7 +16,7 @@ from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import RECIPES, get_gift_model
 from gift_peft.colormap import GREY, color_range, colorize
 from gift_peft.models.identity import teacher_revision
-from gift_peft.models.loading import load_model, predict_depth, prediction_kind
+from gift_peft.models.loading import DepthModel
 from gift_peft.predict import predict_images
 
 
@@ -24,7 +24,7 @@ from gift_peft.predict import predict_images
 def adapter_dir(tmp_path_factory, base_dir):
     """A random adapter of the tiny base, as training would leave it."""
     torch.manual_seed(0)
-    model = get_gift_model(load_model(base_dir, size=SIZE, device="cpu").model, rank=2)
+    model = get_gift_model(DepthModel.from_pretrained(base_dir, size=SIZE, device="cpu").network, rank=2)
     with torch.no_grad():
         for weight in model.parameters():
             if weight.requires_grad:
@@ -94,12 +94,12 @@ def test_scale_zero_is_the_base_and_one_the_adapter(base_dir, adapter_dir, photo
 
 
 def test_loader_takes_size_and_kind_from_where_they_are_stated(base_dir, adapter_dir, tmp_path):
-    loaded = load_model(base_dir, adapter_dir)
-    assert loaded.size == SIZE and loaded.kind == "inverse_depth" and not loaded.model.training
-    assert load_model(base_dir, adapter_dir, size="28x42").size == (28, 42)
-    assert load_model(base_dir).size == (476, 644)
+    loaded = DepthModel.from_pretrained(base_dir, adapter_dir)
+    assert loaded.size == SIZE and loaded.kind == "inverse_depth" and not loaded.network.training
+    assert DepthModel.from_pretrained(base_dir, adapter_dir, size="28x42").size == (28, 42)
+    assert DepthModel.from_pretrained(base_dir).size == (476, 644)
     metric = write_base(tmp_path / "metric", depth_estimation_type="metric", max_depth=10)
-    assert load_model(metric, size=SIZE).kind == "depth"
+    assert DepthModel.from_pretrained(metric, size=SIZE).kind == "depth"
 
 
 def test_folders_duplicates_and_natural_order(base_dir, photo, tmp_path):
@@ -160,14 +160,14 @@ def test_unreadable_pictures_are_named(base_dir, photo, tmp_path):
 def test_an_adapter_for_other_weights_is_refused(adapter_dir, base_dir, tmp_path):
     other = write_base(tmp_path / "other", seed=1)
     with pytest.raises(ValueError, match=r"adapter .* was trained on .*, whose files are not those of base .*other"):
-        load_model(other, adapter_dir)
+        DepthModel.from_pretrained(other, adapter_dir)
     plain = shutil.copytree(adapter_dir, tmp_path / "plain")
     (plain / "gift.json").unlink()  # as PEFT alone saves: the folder it names still tells
     with pytest.raises(ValueError, match=r"whose files are not those of base .*other"):
-        load_model(other, plain)
-    assert load_model(base_dir, plain).size == SIZE
+        DepthModel.from_pretrained(other, plain)
+    assert DepthModel.from_pretrained(base_dir, plain).size == SIZE
     moved = shutil.copytree(base_dir, tmp_path / "moved")
-    assert load_model(moved, adapter_dir).size == SIZE
+    assert DepthModel.from_pretrained(moved, adapter_dir).size == SIZE
 
 
 def test_an_adapter_for_other_shapes_or_layers_is_refused(adapter_dir, base_dir, tmp_path):
@@ -180,12 +180,12 @@ def test_an_adapter_for_other_shapes_or_layers_is_refused(adapter_dir, base_dir,
     config.fusion_hidden_size = 8
     DepthAnythingForDepthEstimation(config).save_pretrained(wide)
     with pytest.raises(ValueError, match=r"adapter .*silent does not fit base .*wide: it was trained on") as error:
-        load_model(wide, silent)
+        DepthModel.from_pretrained(wide, silent)
     assert "\n" not in str(error.value)
     config = json.loads((silent / "adapter_config.json").read_text())
     (silent / "adapter_config.json").write_text(json.dumps(config | {"target_modules": r".*\.(fc1|fc2)"}))
     with pytest.raises(ValueError, match=r"does not fit base .*missing adapter keys"):
-        load_model(base_dir, silent)
+        DepthModel.from_pretrained(base_dir, silent)
 
 
 def test_an_adapter_of_another_hub_id_is_refused(adapter_dir, base_dir, tmp_path, monkeypatch):
@@ -200,7 +200,7 @@ def test_an_adapter_of_another_hub_id_is_refused(adapter_dir, base_dir, tmp_path
         loading._check_base("org/model-b", None, hub, "org/model-a")
     loading._check_base("org/model-a", None, hub, "org/model-a")
     monkeypatch.undo()
-    assert load_model(base_dir, hub).size == SIZE  # a local copy of the hub's model
+    assert DepthModel.from_pretrained(base_dir, hub).size == SIZE  # a local copy of the hub's model
 
 
 def cut(path):
@@ -221,21 +221,21 @@ def test_a_damaged_adapter_names_the_file(name, damage, message, adapter_dir, ba
     broken = shutil.copytree(adapter_dir, tmp_path / "broken")
     damage(broken / name)
     with pytest.raises((ValueError, FileNotFoundError), match=rf"^adapter .*broken: {message}[^\n]*$"):
-        load_model(base_dir, broken)
+        DepthModel.from_pretrained(base_dir, broken)
 
 
 def test_an_adapter_says_what_a_model_without_a_recipe_predicts(adapter_dir, base_dir, monkeypatch):
     monkeypatch.delitem(RECIPES, "depth_anything")
-    assert load_model(base_dir, size=SIZE).kind is None
+    assert DepthModel.from_pretrained(base_dir, size=SIZE).kind is None
     assert json.loads((adapter_dir / "gift.json").read_text())["kind"] == "inverse_depth"
-    assert load_model(base_dir, adapter_dir).kind == "inverse_depth"
+    assert DepthModel.from_pretrained(base_dir, adapter_dir).kind == "inverse_depth"
 
 
 def test_a_model_without_a_recipe_must_be_told_its_kind(model, monkeypatch):
-    assert prediction_kind(model) == "inverse_depth"
+    assert DepthModel(model).known_kind() == "inverse_depth"
     monkeypatch.delitem(RECIPES, "depth_anything")
     with pytest.raises(ValueError, match="no recipe says what depth_anything predicts: kind="):
-        prediction_kind(model)
+        DepthModel(model).known_kind()
 
 
 def test_a_full_disk_names_the_file_and_leaves_nothing(base_dir, photo, tmp_path, monkeypatch):
@@ -261,15 +261,15 @@ def test_nan_predictions_are_errors_that_name_the_picture(base_dir, photo, tmp_p
 # ---- small pieces ----
 
 
-def test_predict_depth_takes_modules_and_functions_and_leaves_no_graph(model):
+def test_predict_takes_modules_and_functions_and_leaves_no_graph(model):
     pixels = torch.randn(3, 3, *SIZE, generator=torch.Generator().manual_seed(0))
-    found = predict_depth(model, pixels)
+    found = DepthModel(model).predict(pixels)
     assert found.shape == (3, *SIZE) and not found.requires_grad
     with torch.no_grad():
         np.testing.assert_array_equal(found[2].numpy(), model(pixel_values=pixels[2:]).predicted_depth[0].numpy())
-    assert torch.equal(predict_depth(lambda x: x[:, 0], pixels), pixels[:, 0])
+    assert torch.equal(DepthModel(lambda x: x[:, 0]).predict(pixels), pixels[:, 0])
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(predict_depth(model, pixels), found)
+        assert torch.equal(DepthModel(model).predict(pixels), found)
 
 
 def test_colours_near_is_bright_and_unknown_is_grey():
@@ -290,4 +290,4 @@ def test_a_truncated_base_is_one_line(base_dir, tmp_path):
     weights = (base / "model.safetensors").read_bytes()
     (base / "model.safetensors").write_bytes(weights[: len(weights) // 2])
     with pytest.raises(ValueError, match=r"^base model .*cut: [^\n]+$"):
-        load_model(base)
+        DepthModel.from_pretrained(base)

@@ -25,7 +25,7 @@ from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.dataset.gift_i import FEATURES, gift_i_splits, load_gift_i
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.images import open_image, read_image
-from gift_peft.models.loading import load_base, load_model
+from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.models.pixels import resolve_size
 from gift_peft.training import train
 
@@ -72,7 +72,7 @@ def test_a_base_in_a_pickle_that_runs_code_is_refused(base_dir, tmp_path):
     base = shutil.copytree(base_dir, tmp_path / "base")
     (base / "model.safetensors").unlink()
     torch.save({"x": Code(tmp_path / "ran")}, base / "pytorch_model.bin")
-    for load in (load_base, load_model):
+    for load in (load_base, DepthModel.from_pretrained):
         with pytest.raises((ValueError, OSError)) as caught:
             load(base)
         assert "\n" not in str(caught.value)
@@ -84,7 +84,7 @@ def test_an_adapter_in_a_pickle_is_not_read(base_dir, adapter, tmp_path):
     (folder / "adapter_model.safetensors").unlink()
     (folder / "adapter_model.bin").write_bytes(pickle.dumps(Code(tmp_path / "ran")))
     with pytest.raises(FileNotFoundError, match=r"the folder has no adapter_model\.safetensors"):
-        load_model(base_dir, folder)
+        DepthModel.from_pretrained(base_dir, folder)
     assert not (tmp_path / "ran").exists()
 
 
@@ -95,7 +95,7 @@ def test_a_base_that_brings_code_is_refused_without_asking(base_dir, tmp_path):
     auto_map = {"AutoConfig": "custom.C", "AutoModelForDepthEstimation": "custom.C"}
     config |= {"model_type": "unheard_of", "auto_map": auto_map}
     (base / "config.json").write_text(json.dumps(config))
-    for load in (load_base, load_model):
+    for load in (load_base, DepthModel.from_pretrained):
         with pytest.raises(ValueError, match=r"base model .*base: "):
             load(base)
     assert not (tmp_path / "ran").exists()
@@ -110,7 +110,7 @@ def test_an_adapter_cannot_have_a_module_imported(base_dir, adapter, tmp_path, m
     config["auto_mapping"] = {"base_model_class": "X", "parent_library": "evil"}
     (folder / "adapter_config.json").write_text(json.dumps(config))
     with pytest.raises(ValueError, match=r"adapter_config\.json \(megatron_config cannot be"):
-        load_model(base_dir, folder)
+        DepthModel.from_pretrained(base_dir, folder)
     assert not (tmp_path / "ran").exists()
 
 
@@ -284,7 +284,7 @@ def test_fuzz_adapter_files(name, read, loads, base_dir, adapter, tmp_path):
         (folder / name).write_bytes(mutated_json(text, generator))
         refused += one_line_or_fine(lambda: read(folder))
         if trial < loads:
-            refused += one_line_or_fine(lambda: load_model(base_dir, folder))
+            refused += one_line_or_fine(lambda: DepthModel.from_pretrained(base_dir, folder))
     assert refused
 
 

@@ -15,6 +15,7 @@ from gift_peft.models import register_models
 __version__ = "0.1.0"
 
 _HOME = {
+    "DepthModel": "models.loading",
     "GeometryConsistencyError": "losses",
     "GiftI": "dataset.gift_i",
     "GiftRecipe": "adapters.recipes",
@@ -27,8 +28,8 @@ _HOME = {
     "VggtForDepthEstimation": "models.vggt",
     "align": "evaluation.alignment",
     "depth_metrics": "evaluation.metrics",
-    "evaluate_booster": "evaluation.on_booster",
-    "evaluate_gift_i": "evaluation.on_gift_i",
+    "evaluate_booster": "evaluation.evaluate",
+    "evaluate_gift_i": "evaluation.evaluate",
     "geometry_consistency_error": "losses",
     "get_gift_model": "adapters.recipes",
     "gift_loss": "losses",

@@ -65,7 +65,7 @@ def to_rgb(image: Image.Image, name: str) -> Image.Image:
     return image.convert("RGB")
 
 
-def read_image(source: str | Path | bytes, name: str | None = None) -> Image.Image:
+def read_image(source: str | Path | bytes | Image.Image, name: str | None = None) -> Image.Image:
     """An upright 8-bit RGB picture; ValueError or FileNotFoundError (one line, naming the file) for anything else."""
     return to_rgb(open_image(source, name), name or str(source))
 

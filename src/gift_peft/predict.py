@@ -1,7 +1,7 @@
 """Depth for single pictures (`gift-peft predict`).
 
-Pictures are resized as in training and the prediction is brought back to each picture's own size with the bicubic
-interpolation of transformers' `post_process_depth_estimation`. Values stay in the network's native units.
+Pictures are resized as in training, and the image processor's own `post_process_depth_estimation` brings the
+prediction back to each picture's size, as in transformers' pipeline. Values stay in the network's native units.
 """
 
 import io
@@ -14,8 +14,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from gift_peft.files import write_whole
-from gift_peft.images import list_images, read_image
-from gift_peft.models.pixels import to_pixel_values
+from gift_peft.images import list_images
 from gift_peft.options import OptionParser, add_adapter, add_base
 
 if TYPE_CHECKING:
@@ -32,6 +31,7 @@ def predict_images(
     size: str | tuple[int, int] | None = None,
     kind: str | None = None,
     revision: str | None = None,
+    focal_length: float | tuple[float, float] | None = None,
     device: "str | torch.device | None" = None,
     progress: bool = True,
 ) -> list[Path]:
@@ -43,9 +43,10 @@ def predict_images(
 
     Args:
         images: files, or folders whose pictures are taken.
-        base, adapter, adapter_scale, revision, size, device: as in `load_model`.
+        base, adapter, adapter_scale, revision, size, device: as in `DepthModel.from_pretrained`.
         out: folder; made if missing, existing files of these names are replaced.
         kind (`str`, *optional*): decides which end is bright; default the recipe's.
+        focal_length (*optional*): of the camera in pixels, as in `DepthModel.depth_at`.
 
     Returns:
         `list[Path]`: the npy file of each picture.
@@ -55,26 +56,22 @@ def predict_images(
             non-finite prediction, an adapter for another base.
     """
     from gift_peft.colormap import color_range, colorize  # not for `--help`, which needs neither OpenCV nor torch
-    from gift_peft.models.loading import load_model, predict_depth
+    from gift_peft.models.loading import DepthModel
 
     files = list_images(images)
     names = _unique_names(files, beside=adapter is not None)
-    loaded = load_model(base, adapter, adapter_scale, revision, size, device)
-    kind = kind or loaded.kind
+    model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     for file, name in tqdm(
         list(zip(files, names, strict=True)), desc="predict", unit="image", disable=None if progress else True
     ):
-        image = read_image(file)
-        pixel_values = to_pixel_values([image], loaded.processor, loaded.size)
-        depths = {name: _at_image_size(predict_depth(loaded.model, pixel_values), image, file)}
+        depths = {name: model.depth_at(file, focal_length)}
         if adapter is not None:
-            with loaded.model.disable_adapter():
-                depths[f"{name}_base"] = _at_image_size(predict_depth(loaded.model, pixel_values), image, file)
+            depths[f"{name}_base"] = model.depth_at(file, focal_length, base=True)
         low, high = color_range(*depths.values())
         for stem, depth in depths.items():
-            picture = Image.fromarray(colorize(depth, low, high, kind or "inverse_depth"))
+            picture = Image.fromarray(colorize(depth, low, high, model.kind or "inverse_depth"))
             _write(folder / f"{stem}.npy", lambda file, depth=depth: np.save(file, depth))
             _write(folder / f"{stem}.png", lambda file, picture=picture: picture.save(file, "PNG"))
     return [folder / f"{name}.npy" for name in names]
@@ -84,16 +81,6 @@ def _write(path: Path, save: Callable[[io.BytesIO], None]) -> None:
     content = io.BytesIO()
     save(content)
     write_whole(path, content.getvalue())
-
-
-def _at_image_size(depth: "torch.Tensor", image: Image.Image, file: Path) -> np.ndarray:
-    """(1,h,w) to the picture's (H,W) as transformers does it; ValueError for NaN and infinity."""
-    import torch
-
-    if not torch.isfinite(depth).all():
-        raise ValueError(f"{file}: the prediction has NaN or infinite values")
-    size = (image.height, image.width)
-    return torch.nn.functional.interpolate(depth[None], size=size, mode="bicubic", align_corners=False)[0, 0].numpy()
 
 
 def _unique_names(files: Sequence[Path], beside: bool) -> list[str]:
@@ -122,6 +109,8 @@ def make_parser() -> OptionParser:
     parser.add_argument("images", nargs="+", metavar="IMAGE", help="picture files or folders of them")
     add_base(parser)
     add_adapter(parser)
+    text = "of the camera that took the pictures, where the model takes one (Metric3D)"
+    parser.add_argument("--focal-length", type=float, metavar="PIXELS", help=text)
     parser.add_argument("--out", "--output-dir", required=True, metavar="DIR", help="folder for the npy and png files")
     return parser
 
@@ -137,6 +126,7 @@ def run(argv: Sequence[str]) -> int:
         size=args.size,
         kind=args.kind,
         revision=args.revision,
+        focal_length=args.focal_length,
     )
     print(f"Depth maps written to {args.out}: {len(files)}")
     return 0

@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # torch takes longer to import than the command line takes to
 
 SPLITS = ("train", "validation")
 SURFACES = ["mirror", "transparent"]
+KINDS = ("depth", "inverse_depth")  # what a model predicts
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from gift_peft.dataset.gift_i import FEATURES, GiftI, dataset_fingerprint, gift_
 from gift_peft.dataset.rows import parsed
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.dataset.writer import SCHEMA, write_gift_i
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
+from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.rules import GroupPictures
 from gift_peft.training.teacher import make_proxies
 

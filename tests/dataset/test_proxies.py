@@ -16,6 +16,7 @@ from PIL import Image
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.proxies import default_proxies_dir, read_header, write_proxies
 from gift_peft.dataset.tensors import collate_group
+from gift_peft.models import loading
 from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.training import teacher
 from gift_peft.training.teacher import make_proxies
@@ -118,7 +119,7 @@ def test_hub_ids_are_pinned_by_commit(raw_tree, base_dir, tmp_path, monkeypatch)
         return f"/cache/models--owner--net/snapshots/{commits[revision or 'main']}/{name}"
 
     monkeypatch.setattr("transformers.utils.hub.cached_file", cached_file)
-    monkeypatch.setattr(teacher, "load_base", lambda base, revision: (tiny_model(), tiny_processor()))
+    monkeypatch.setattr(loading, "load_base", lambda base, revision: (tiny_model(), tiny_processor()))
     commits["main"] = commits["v1"] = "a" * 40
     assert teacher_id("owner/net") == "owner--net" and teacher_id("owner/net", "v1") == "owner--net@v1"
     assert teacher_revision("owner/net", "v1") == "a" * 40

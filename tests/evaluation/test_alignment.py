@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from gift_peft.evaluation.alignment import align
 from gift_peft.evaluation.fitting import DegenerateFitError
 from gift_peft.evaluation.metrics import depth_metrics
-from gift_peft.evaluation.protocols import KINDS, PROTOCOLS, Protocol, get_protocol, list_protocols
+from gift_peft.evaluation.protocols import PROTOCOLS, Protocol, get_protocol, list_protocols
+from gift_peft.rules import KINDS
 
 SHAPE = (7, 9)
 ALL = np.ones(SHAPE, bool)
@@ -336,7 +337,7 @@ def test_protocols_state_their_choices():
     assert "no clipping" in PROTOCOLS["native"].describe()
     assert "no alignment" in PROTOCOLS["metric"].describe() and "l2" not in PROTOCOLS["metric"].describe()
     assert "negative inverse depth is near" in PROTOCOLS["depth4tom"].describe()
-    for wrong in ({"space": "both"}, {"dof": "gain"}, {"loss": "l1"}, {"aggregation": "scene"}, {"floor": "min"}):
+    for wrong in ({"space": "both"}, {"dof": "gain"}, {"loss": "l1"}, {"floor": "min"}):
         with pytest.raises(ValueError, match=f"protocol 'mine': {next(iter(wrong))} .*; what is computed is"):
             Protocol("mine", **{"space": "depth"} | wrong)
     for space in ("auto", "inverse"):

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from gift_peft.dataset.tensors import Group
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
-from gift_peft.evaluation.results import REGIONS, GiftIReport
-from gift_peft.evaluation.scoring import consensus
+from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.results import REGIONS, Report
+from gift_peft.evaluation.samples import consensus
 
 H, W = 6, 8
 
@@ -277,7 +277,7 @@ def test_bad_predictions_and_arguments_are_named():
         evaluate_gift_i([group])
     with pytest.raises(ValueError, match="no groups"):
         evaluate([])
-    with pytest.raises(ValueError, match="no group of the dataset has true depth"):
+    with pytest.raises(ValueError, match='reference="depth" needs the rows of load_gift_i'):
         evaluate([group], reference="depth", kind="depth")
 
 
@@ -290,9 +290,9 @@ def test_saved_reports_hold_no_nan_and_load_again(tmp_path):
 
     for line in [(folder / "metrics.json").read_text(), *(folder / "rows.jsonl").read_text().splitlines()]:
         json.loads(line, parse_constant=refuse)
-    loaded = GiftIReport.load(folder)
+    loaded = Report.load(folder)
     assert loaded.to_dict() == report.to_dict() and len(loaded.rows) == len(report.rows)
     assert loaded.rows[3]["base"]["all"]["mae"] is None
     assert {path.name for path in folder.iterdir()} == {"metrics.json", "rows.jsonl"}
     with pytest.raises(FileNotFoundError, match=r"metrics\.json is missing"):
-        GiftIReport.load(tmp_path)
+        Report.load(tmp_path)

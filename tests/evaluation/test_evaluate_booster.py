@@ -18,8 +18,8 @@ from PIL import Image
 
 from gift_peft import evaluate_booster
 from gift_peft.evaluation.booster_scenes import find_booster, read_ground_truth
-from gift_peft.evaluation.protocols import Protocol
-from gift_peft.evaluation.results import REGIONS, BoosterReport, GiftIReport, load_report
+from gift_peft.evaluation.results import REGIONS, Report
+from gift_peft.evaluation.tables import markdown_table
 
 SAMPLE = Path(__file__).parents[3] / "shared" / "data" / "booster_web_quarter"
 
@@ -58,24 +58,9 @@ def test_images_without_a_class_are_skipped_in_it_and_the_mean_is_over_images(tm
     assert report.counts["without_tom"] == 2 and report.counts["skipped"] == 0
     matt = [row for row in report.rows if row["group_id"] == "Matt"]
     assert all(np.isnan(row["base"]["tom"]["mae"]) and row["pixels"]["tom"] == 0 for row in matt)
-    pooled = evaluate(tmp_path, predictions=tmp_path / "pred", protocol=pooling(), kind="inverse_depth").summary
-    scenes = evaluate(tmp_path, predictions=tmp_path / "pred", protocol=pooling("group"), kind="inverse_depth").summary
     rows = report.rows
-    pixels = np.array([row["pixels"]["all"] for row in rows])
-    for metric, power in (("mae", 1), ("rmse", 2)):
-        values = np.array([row["base"]["all"][metric] for row in rows])
-        expected = ((pixels * values**power).sum() / pixels.sum()) ** (1 / power)
-        assert pooled["all"][metric] == pytest.approx(expected, rel=1e-12)
-        assert pooled["all"][metric] != pytest.approx(report.summary["all"][metric], rel=1e-4)
     by_scene = [np.mean([r["base"]["all"]["mae"] for r in rows if r["group_id"] == name]) for name in truths]
-    assert scenes["all"]["mae"] == pytest.approx(np.mean(by_scene), rel=1e-12)
     assert report.per_scene["Matt"]["summary"]["all"]["mae"] == pytest.approx(by_scene[-1], rel=1e-12)
-
-
-def pooling(aggregation="pixel"):
-    return Protocol(
-        "pooled", space="inverse", clip=(1.0, 10000.0), nonpositive="near", aggregation=aggregation, source="test"
-    )
 
 
 @pytest.mark.parametrize("kind", ["inverse_depth", "depth"])
@@ -120,16 +105,16 @@ def test_tom_classes_move_the_target(tmp_path):
     assert pixels["tom"] + pixels["other"] == pixels["all"]
 
 
-def test_fit_region_other_leaves_the_target_out_of_the_fit(tmp_path):
+def test_the_fit_is_over_all_known_pixels_and_every_image_needs_its_prediction(tmp_path):
     truths = write_root(tmp_path, scenes=1)
     maps = write_predictions(tmp_path / "pred", truths, images=1)
-    mine = Protocol("outside", space="auto", fit_region="other", clip=(1.0, 10000.0))
+    options = {"predictions": tmp_path / "pred", "kind": "inverse_depth", "resize": 1}
     with pytest.raises(FileNotFoundError, match=r"1 missing.*Scene0/camera_00/im1"):
-        evaluate(tmp_path, predictions=tmp_path / "pred", kind="inverse_depth", resize=1, protocol=mine)
+        evaluate(tmp_path, **options)
     np.save(tmp_path / "pred" / "Scene0" / "camera_00" / "im1.npy", maps["Scene0", 0])
-    row = evaluate(tmp_path, predictions=tmp_path / "pred", kind="inverse_depth", resize=1, protocol=mine).rows[0]
+    row = evaluate(tmp_path, **options).rows[0]
     truth = truths["Scene0"]
-    use = (truth["disparity"] > 0) & (truth["depth"] <= 10000) & (truth["depth"] >= 1) & (truth["classes"] <= 1)
+    use = (truth["disparity"] > 0) & (truth["depth"] <= 10000) & (truth["depth"] >= 1)
     design = np.stack([maps["Scene0", 0][use].astype(float), np.ones(use.sum())], 1)
     scale, shift = np.linalg.lstsq(design, truth["disparity"][use].astype(float) / truth["product"], rcond=None)[0]
     assert (row["base"]["scale"], row["base"]["shift"]) == pytest.approx((scale, shift), rel=1e-6)
@@ -152,7 +137,7 @@ def test_order_of_scenes_and_images_does_not_matter(tmp_path):
     again = evaluate(other, predictions=other / "pred", kind="inverse_depth")
     assert again.summary == report.summary
     for name in ("base", "base_normalized"):
-        assert again.illumination_gce[name] == pytest.approx(report.illumination_gce[name], rel=1e-6)
+        assert again.gce[name] == pytest.approx(report.gce[name], rel=1e-6)
 
 
 def test_constant_predictions_are_skipped_and_counted(tmp_path):
@@ -228,8 +213,8 @@ def test_a_model_beside_its_base(tmp_path):
     for mine, theirs in zip(stored.rows, alone.rows, strict=True):
         assert mine["base"]["all"] == pytest.approx(theirs["base"]["all"], rel=1e-5)
         assert mine["base"]["target_mean"] == pytest.approx(theirs["base"]["target_mean"], rel=1e-5)
-    assert alone.illumination_gce["base"] == pytest.approx(np.mean(gce), rel=1e-5)
-    assert report.illumination_gce["adapted"] is not None and alone.illumination_gce["adapted"] is None
+    assert alone.gce["base"] == pytest.approx(np.mean(gce), rel=1e-5)
+    assert report.gce["adapted"] is not None and alone.gce["adapted"] is None
 
 
 def test_damaged_images_and_wrong_sizes_are_named(tmp_path):
@@ -271,7 +256,7 @@ def test_two_processes_give_the_report_of_one(tmp_path):
     truths = write_root(tmp_path, scenes=3)
     write_predictions(tmp_path / "pred", truths)
     debug_launcher(_evaluate_in_two_processes, (tmp_path,), num_processes=2)
-    one, two = (load_report(tmp_path / rank) for rank in "01")
+    one, two = (Report.load(tmp_path / rank) for rank in "01")
     alone = evaluate(tmp_path, predictions=tmp_path / "pred", kind="inverse_depth")
     assert one.to_dict() == two.to_dict() == alone.to_dict()
     assert one.rows == two.rows and [row["group_id"] for row in one.rows[::2]] == ["Scene0", "Scene1", "Scene2"]
@@ -284,10 +269,10 @@ def test_reports_are_saved_and_loaded(tmp_path):
     truths = write_root(tmp_path, images=1)
     write_predictions(tmp_path / "pred", truths, images=1)
     report = evaluate(tmp_path, predictions=tmp_path / "pred", protocol="depth4tom")
-    assert report.illumination_gce["num_groups"] == 0 and report.illumination_gce["num_skipped"] == 2
+    assert report.gce["num_groups"] == 0 and report.gce["num_skipped"] == 2
     folder = report.save(tmp_path / "out")
-    loaded = load_report(folder)
-    assert isinstance(loaded, BoosterReport) and loaded.to_dict() == report.to_dict()
+    loaded = Report.load(folder)
+    assert loaded.dataset == "booster" and loaded.to_dict() == report.to_dict()
     rows = [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
     assert rows == loaded.rows and len(rows) == 2
     about = loaded.about
@@ -295,14 +280,34 @@ def test_reports_are_saved_and_loaded(tmp_path):
         "inverse_depth", "all", "balanced", False
     )  # fmt: skip
     with pytest.raises(FileNotFoundError, match=r"metrics\.json is missing"):
-        load_report(tmp_path)
-    with pytest.raises(ValueError, match=r"metrics\.json is no GiftIReport: it has illumination_gce, per_scene"):
-        GiftIReport.load(folder)
+        Report.load(tmp_path)
     metrics = (folder / "metrics.json").read_text()
-    for broken, message in ((metrics[:-30], "damaged"), ("[]", "damaged"), ("{}", "is no GiftIReport: it lacks ")):
+    assert json.loads(metrics)["illumination_gce"] == loaded.gce
+    unknown = metrics.replace('"illumination_gce"', '"gce"')
+    for broken, message in (
+        (metrics[:-30], "damaged"),
+        ("[]", "damaged"),
+        ("{}", "is no evaluation: it lacks "),
+        (unknown, "is no evaluation: it has per_scene"),
+    ):
         (folder / "metrics.json").write_text(broken)
         with pytest.raises(ValueError, match=rf"metrics\.json:? {message}"):
-            load_report(folder)
+            Report.load(folder)
+
+
+def test_evaluations_saved_before_the_report_knew_both_datasets_are_read(tmp_path):
+    """As 0.1.0 wrote them: no `dataset`, and a protocol with choices that are gone."""
+    truths = write_root(tmp_path, images=1)
+    write_predictions(tmp_path / "pred", truths, images=1)
+    report = evaluate(tmp_path, predictions=tmp_path / "pred", protocol="depth4tom")
+    folder = report.save(tmp_path / "out")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert "dataset" not in metrics and "consensus" not in metrics
+    metrics["protocol"] |= {"fit_region": "valid", "aggregation": "image"}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    loaded = Report.load(folder)
+    assert (loaded.dataset, loaded.reference, loaded.by_surface) == ("booster", "depth", {})
+    assert markdown_table(loaded) == markdown_table(report)
 
 
 def benchmark(folder, images, size):
@@ -345,7 +350,7 @@ def test_the_real_scene_end_to_end(tmp_path):
     facts = {"disparity": disparity, "classes": classes, "product": 940 * 63.799999999999997}
     report = evaluate(SAMPLE, predictions=tmp_path, protocol="depth4tom")
     assert_close(report.summary, depth4tom_by_hand({"ShotGlasses": facts}, maps, 0.25))
-    assert report.illumination_gce["num_groups"] == 1 and report.illumination_gce["base"] > 0
+    assert report.gce["num_groups"] == 1 and report.gce["base"] > 0
 
     model = evaluate(SAMPLE, model=tiny_model(), processor=tiny_processor(), size=SIZE, occlusion="noc")
     assert model.counts["scored"] == 3 and np.isfinite(model.summary["tom"]["rmse"])

@@ -11,9 +11,10 @@ from PIL import Image
 
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.writer import write_gift_i
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
+from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.results import REGIONS
 from gift_peft.evaluation.tables import text_table
+from gift_peft.models.loading import DepthModel
 from gift_peft.reports.panels import group_panels
 
 OPTIONS = {"processor": tiny_processor(), "size": SIZE, "progress": False}
@@ -81,15 +82,15 @@ def test_unknown_depth_all_over_the_target_is_counted(tmp_path):
 
 def test_panels_hold_an_observation_on_the_reference_grid(tmp_path):
     dataset, depths = depth_tree(tmp_path, (30, 40))
-    options = {"processor": tiny_processor(), "size": SIZE, "kind": "inverse_depth"}
-    (panel,) = group_panels(dataset[0], {1: "mirror"}, tiny_model(1), tiny_model(), **options)
+    model = DepthModel(tiny_model(1), tiny_processor(), SIZE, "inverse_depth", teacher=tiny_model())
+    (panel,) = group_panels(dataset[0], {dataset[0]["image_names"][1]: "mirror"}, model)
     assert panel.label == "mirror"
     assert panel.base.shape == panel.adapted.shape == panel.target.shape == (30, 40)
     np.testing.assert_array_equal(panel.reference, depths[1])
     assert panel.image.size == (40, 30) and panel.target.sum() == 26 * 36 and panel.protocol == "gift"
     assert not np.array_equal(panel.base, panel.adapted)
-    with pytest.raises(ValueError, match="group g has no proxy"):
-        group_panels(dataset[0], {0: "x"}, tiny_model(1), tiny_model(), reference="proxy", **options)
+    with pytest.raises(ValueError, match="group g has no reference to compare"):
+        group_panels(dataset[0], {dataset[0]["image_names"][0]: "x"}, model, reference="proxy")
 
 
 CLEARGRASP = Path(__file__).parents[3] / "shared" / "data" / "cleargrasp_d435"

@@ -10,8 +10,8 @@ from helpers.tiny import SIZE, tiny_model, tiny_processor, write_base, write_raw
 
 from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
-from gift_peft.evaluation.results import GiftIReport
+from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.verb import run_evaluation
 from gift_peft.training.teacher import make_proxies
 
@@ -67,6 +67,11 @@ def test_modes_and_gradients_are_left_as_they_were(raw_tree, adapter_model):
     assert [weight.requires_grad for weight in adapter_model.parameters()] == flags
 
 
+def test_a_dataset_without_true_depth_is_told(raw_tree):
+    with pytest.raises(ValueError, match="no group of the dataset has true depth"):
+        evaluate_gift_i(raw_tree, tiny_model(), processor=tiny_processor(), reference="depth", progress=False)
+
+
 def test_the_train_split_has_gce_and_no_accuracy(raw_tree, adapter_model):
     report = evaluate_gift_i(load_gift_i(raw_tree, "train"), shake(adapter_model), size=SIZE, progress=False)
     assert report.gce["num_groups"] == 2 and report.counts["scored"] == 0 and report.counts["images"] == 5
@@ -118,7 +123,7 @@ def shake_alone():
 def test_two_processes_give_the_report_of_one(tmp_path):
     raw = write_raw_tree(tmp_path / "raw", validation=(2, 3, 2))
     debug_launcher(_evaluate_in_two_processes, (raw, tmp_path), num_processes=2)
-    one, two = (GiftIReport.load(tmp_path / rank) for rank in "01")
+    one, two = (Report.load(tmp_path / rank) for rank in "01")
     assert one.to_dict() == two.to_dict() and one.rows == two.rows
     assert [row["group_id"] for row in one.rows] == [f"scene_{100 + g}" for g in (0, 0, 1, 1, 1, 2, 2)]
     alone = evaluate_gift_i(raw, shake_alone(), processor=tiny_processor(), size=SIZE, progress=False)
@@ -127,8 +132,9 @@ def test_two_processes_give_the_report_of_one(tmp_path):
 
 def test_paths_and_model_ids_are_accepted(raw_tree, base_dir, tmp_path):
     other = write_base(tmp_path / "other", seed=1)
-    from gift_peft.models.loading import load_model
+    from gift_peft.models.loading import DepthModel
 
-    report = evaluate_gift_i(raw_tree, load_model(other, size=SIZE).model, str(base_dir), size=SIZE, progress=False)
+    model = DepthModel.from_pretrained(other).network
+    report = evaluate_gift_i(raw_tree, model, str(base_dir), size=SIZE, progress=False)
     expected = evaluate_gift_i(raw_tree, tiny_model(), processor=tiny_processor(), size=SIZE, progress=False)
     assert report.base == expected.base and report.summary != report.base

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from gift_peft.evaluation.metrics import METRICS
 from gift_peft.evaluation.protocols import PROTOCOLS
-from gift_peft.evaluation.results import REGIONS, GiftIReport
+from gift_peft.evaluation.results import REGIONS, Report
 from gift_peft.evaluation.statistics import GroupBootstrap, mean_interval, median_of
 from gift_peft.evaluation.table_formats import (
     Cell,
@@ -141,32 +141,24 @@ def test_a_base_alone_has_no_changes(table):
 
 def test_a_loaded_report_gives_the_same_tables(tmp_path):
     report = make_report(base={**make_report().base, "other": metrics(*[math.nan] * 4)})
-    loaded = GiftIReport.load(report.save(tmp_path))
+    loaded = Report.load(report.save(tmp_path))
     assert text_table(loaded) == text_table(report) and markdown_table(loaded) == markdown_table(report)
 
 
 # ---- intervals and medians ----
 
 
-def straight_mean(rows, model, region, metric, aggregation):
-    """Word for word what the aggregation says, over any rows (a group may occur twice under two names)."""
-    values = [(r["group_id"], r[model][region][metric], r["pixels"][region]) for r in rows]
-    values = [value for value in values if not math.isnan(value[1])]
-    if aggregation == "image":
-        return sum(v for _, v, _ in values) / len(values)
-    if aggregation == "pixel":
-        power = 2 if metric == "rmse" else 1
-        return (sum(n * v**power for _, v, n in values) / sum(n for *_, n in values)) ** (1 / power)
-    groups = sorted({g for g, *_ in values})
-    means = [sum(v for g, v, _ in values if g == group) / sum(g == group for g, *_ in values) for group in groups]
-    return sum(means) / len(means)
+def straight_mean(rows, model, region, metric):
+    """The mean over images, over any rows (a group may occur twice under two names)."""
+    values = [row[model][region][metric] for row in rows]
+    values = [value for value in values if not math.isnan(value)]
+    return sum(values) / len(values)
 
 
-@pytest.mark.parametrize("aggregation", ["image", "pixel", "group"])
 @pytest.mark.parametrize("metric", ["mae", "rmse"])
-def test_bootstrap_draws_whole_groups_and_takes_the_tables_own_mean(aggregation, metric):
+def test_bootstrap_draws_whole_groups_and_takes_the_tables_own_mean(metric):
     rows = random_rows([3, 1, 2, 4])
-    bootstrap = GroupBootstrap(rows, aggregation)
+    bootstrap = GroupBootstrap(rows)
     means = bootstrap._means("base", "other", metric)
     names = ["g00", "g01", "g02", "g03"]
     for draw, mean in list(zip(bootstrap.draws, means, strict=True))[:25]:
@@ -174,10 +166,10 @@ def test_bootstrap_draws_whole_groups_and_takes_the_tables_own_mean(aggregation,
         for name, times in zip(names, draw, strict=True):
             for copy in range(int(times)):
                 drawn += [row | {"group_id": f"{name}-{copy}"} for row in rows if row["group_id"] == name]
-        assert mean == pytest.approx(straight_mean(drawn, "base", "other", metric, aggregation), rel=1e-12)
+        assert mean == pytest.approx(straight_mean(drawn, "base", "other", metric), rel=1e-12)
     low, high = bootstrap.interval("base", "other", metric)
     assert (low, high) == pytest.approx(np.percentile(means, [2.5, 97.5]))
-    assert low < straight_mean(rows, "base", "other", metric, aggregation) < high
+    assert low < straight_mean(rows, "base", "other", metric) < high
 
 
 def test_changes_come_from_the_same_draws():

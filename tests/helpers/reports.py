@@ -7,8 +7,7 @@ from gift_peft.evaluation.metrics import METRICS
 from gift_peft.evaluation.protocols import PROTOCOLS
 from gift_peft.evaluation.results import (
     REGIONS,
-    BoosterReport,
-    GiftIReport,
+    Report,
     count_rows,
     detect_collapse,
     summarize,
@@ -21,7 +20,7 @@ def metrics(mae, abs_rel, rmse, delta1):
     return {"mae": mae, "abs_rel": abs_rel, "rmse": rmse, "delta1": delta1}
 
 
-def make_report(**changes) -> GiftIReport:
+def make_report(**changes) -> Report:
     base = {
         "tom": metrics(0.2, 0.1, 0.4, 80.0),
         "other": metrics(0.1, 0.05, 0.2, 95.0),
@@ -63,7 +62,7 @@ def make_report(**changes) -> GiftIReport:
         "groups": [],
         "rows": [],
     }
-    return GiftIReport(**fields | changes)
+    return Report(**fields | changes)
 
 
 def random_rows(sizes: list[int], seed: int = 0) -> list[dict]:
@@ -84,7 +83,7 @@ def random_rows(sizes: list[int], seed: int = 0) -> list[dict]:
     return rows
 
 
-def report_of(rows: list[dict], aggregation: str = "image", booster: bool = False, **changes):
+def report_of(rows: list[dict], booster: bool = False, **changes):
     """A report whose means are those of the rows."""
     protocol = PROTOCOLS["gift" if booster else "native"]
     groups = [
@@ -93,22 +92,20 @@ def report_of(rows: list[dict], aggregation: str = "image", booster: bool = Fals
         for k, name in enumerate(dict.fromkeys(row["group_id"] for row in rows))
     ]
     fields = {
-        "summary": summarize(rows, "adapted", aggregation),
-        "base": summarize(rows, "base", aggregation),
+        "summary": summarize(rows, "adapted"),
+        "base": summarize(rows, "base"),
         "collapse": detect_collapse(rows),
         "counts": count_rows(rows, len(groups), "adapted"),
-        "protocol": protocol.to_dict() | {"description": protocol.describe(), "aggregation": aggregation},
+        "protocol": protocol.to_dict() | {"description": protocol.describe()},
         "adapted": True,
         "groups": groups,
         "rows": rows,
     }
-    gce = summarize_gce(groups, ["base", "adapted"])
+    fields["gce"] = summarize_gce(groups, ["base", "adapted"])
     if booster:
         about = {"subset": "balanced", "occlusion": "all", "tom_classes": [2, 3], "official": False}
-        fields |= {"illumination_gce": gce, "per_scene": {}, "unit": "mm", "about": about}
-        return BoosterReport(**fields | changes)
-    fields |= {"gce": gce, "consensus": None, "by_surface": {}, "reference": "proxy", "unit": "native units"}
-    return GiftIReport(**fields | changes)
+        return Report(**fields | {"dataset": "booster", "unit": "mm", "about": about} | changes)
+    return Report(**fields | {"reference": "proxy", "unit": "native units"} | changes)
 
 
 def panel(seed=0, kind="inverse_depth", size=(60, 75), **changes) -> Panel:

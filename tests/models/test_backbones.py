@@ -12,7 +12,7 @@ from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
 from gift_peft import get_gift_model, set_adapter_scale
 from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
+from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.models.metric3d import Metric3DImageProcessorPil
 from gift_peft.models.pixels import to_pixel_values
 from gift_peft.models.vggt import VggtImageProcessorPil

@@ -12,9 +12,8 @@ from torch import nn
 from transformers import DPTConfig, DPTForDepthEstimation, DPTImageProcessorPil
 
 from gift_peft import evaluate_booster
-from gift_peft.evaluation.verb import run_booster, run_evaluation
-from gift_peft.models.loading import load_model, predict_depth
-from gift_peft.models.pixels import to_pixel_values
+from gift_peft.evaluation.verb import run_evaluation
+from gift_peft.models.loading import DepthModel
 from gift_peft.predict import predict_images
 
 RAMP = torch.linspace(1, 2, 98)
@@ -84,33 +83,33 @@ def packages(monkeypatch):
 
 
 def test_da3_is_called_view_by_view_in_float32(packages):
-    loaded = load_model("da3:known", size="70x98")
-    assert (loaded.size, loaded.kind, loaded.model.config.depth_estimation_type) == ((70, 98), "depth", None)
+    loaded = DepthModel.from_pretrained("da3:known", size="70x98")
+    assert (loaded.size, loaded.kind, loaded.millimeters_per_unit) == ((70, 98), "depth", 1)
     pixels = torch.rand(3, 3, 70, 98)
-    depth = predict_depth(loaded.model, pixels)
+    depth = loaded.predict(pixels)
     torch.testing.assert_close(depth, 2 * pixels.mean(1) + RAMP)
-    assert load_model("da3:known-nested", size="70x98").model.config.depth_estimation_type == "metric"
-    assert load_model("da3:known").size == (476, 644)
+    assert DepthModel.from_pretrained("da3:known-nested", size="70x98").millimeters_per_unit == 1000
+    assert DepthModel.from_pretrained("da3:known").size == (476, 644)
     picture = Image.new("RGB", (50, 40), (124, 116, 104))  # ImageNet's mean colour
-    assert to_pixel_values([picture], loaded.processor, (70, 98)).abs().max() < 0.02
+    assert loaded.inputs([picture]).abs().max() < 0.02
 
 
-@pytest.mark.parametrize(("name", "metric"), [("known", "metric"), ("old", None)])
-def test_moge_is_asked_without_its_mask(packages, name, metric):
-    loaded = load_model(f"moge:{name}", size="70x98")
-    assert loaded.kind == "depth" and loaded.model.config.depth_estimation_type == metric
+@pytest.mark.parametrize(("name", "unit"), [("known", 1000), ("old", 1)])
+def test_moge_is_asked_without_its_mask(packages, name, unit):
+    loaded = DepthModel.from_pretrained(f"moge:{name}", size="70x98")
+    assert loaded.kind == "depth" and loaded.millimeters_per_unit == unit
     pixels = torch.rand(3, 3, 70, 98)
-    torch.testing.assert_close(predict_depth(loaded.model, pixels), 3 * pixels.mean(1) + RAMP)
-    white = to_pixel_values([Image.new("RGB", (50, 40), "white")], loaded.processor, (70, 98))
+    torch.testing.assert_close(loaded.predict(pixels), 3 * pixels.mean(1) + RAMP)
+    white = loaded.inputs([Image.new("RGB", (50, 40), "white")])
     assert (white == 1).all()  # colours from 0 to 1: it normalises them itself
 
 
 def test_they_stand_in_the_table_and_predict(packages, tmp_path, capsys):
     write_root(tmp_path)
     options = {"size": "70x98", "progress": False}
-    report = run_booster(tmp_path, "moge:known", out=tmp_path / "out", **options)
+    report = run_evaluation("moge:known", booster=tmp_path, out=tmp_path / "out", **options)
     assert report.about["base"] == "moge:known" and not report.adapted and "Booster" in capsys.readouterr().out
-    loaded = load_model("moge:known", size="70x98")
+    loaded = DepthModel.from_pretrained("moge:known", size="70x98")
     options = {"processor": loaded.processor, "size": loaded.size, "progress": False}
 
     def plain(pixels):
@@ -119,7 +118,7 @@ def test_they_stand_in_the_table_and_predict(packages, tmp_path, capsys):
     expected = evaluate_booster(tmp_path, plain, kind="depth", **options)
     assert report.summary["tom"] == pytest.approx(expected.summary["tom"], rel=1e-6)
     # The kind comes with the model, and what is metric is in metres.
-    metric = evaluate_booster(tmp_path, loaded.model, protocol="metric", **options)
+    metric = evaluate_booster(tmp_path, loaded, protocol="metric", progress=False)
     expected = evaluate_booster(tmp_path, plain, kind="depth", protocol="metric", prediction_scale=1000, **options)
     assert metric.summary["all"] == pytest.approx(expected.summary["all"], rel=1e-6)
     assert 0 < metric.summary["all"]["mae"] < 4000
@@ -137,17 +136,17 @@ def test_they_are_evaluated_on_gift_i(packages, raw_tree, tmp_path, capsys):
 
 def test_what_is_missing_or_wrong_is_one_line(packages, monkeypatch):
     with pytest.raises(FileNotFoundError, match=r"^base da3:nowhere: no such repository: nowhere$"):
-        load_model("da3:nowhere")
+        DepthModel.from_pretrained("da3:nowhere")
     with pytest.raises(ValueError, match=r"^base moge:broken: 'model_config'$"):
-        load_model("moge:broken")
+        DepthModel.from_pretrained("moge:broken")
     with pytest.raises(ValueError, match="base moge:known: an adapter needs a model of transformers"):
-        load_model("moge:known", adapter="somewhere")
+        DepthModel.from_pretrained("moge:known", adapter="somewhere")
     with pytest.raises(ValueError, match=r"size 71x98: both sides must be positive multiples of the patch size 14"):
-        load_model("moge:known", size="71x98")
+        DepthModel.from_pretrained("moge:known", size="71x98")
     for package, name in (("depth_anything_3.api", "da3"), ("moge.model", "moge")):
         monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
         with pytest.raises(ValueError, match=rf"^base {name}:known: .*pip install"):
-            load_model(f"{name}:known")
+            DepthModel.from_pretrained(f"{name}:known")
 
 
 # ---- architectures of transformers without a recipe ----
@@ -165,8 +164,8 @@ def test_any_depth_model_of_transformers_is_a_base(tmp_path):
     write_root(tmp_path)
     options = {"out": tmp_path / "out", "progress": False, "size": "64x64"}
     with pytest.raises(ValueError, match='no recipe says what dpt predicts: kind="depth"'):
-        run_booster(tmp_path, base, **options)
-    report = run_booster(tmp_path, base, kind="inverse_depth", **options)
+        run_evaluation(base, booster=tmp_path, **options)
+    report = run_evaluation(base, booster=tmp_path, kind="inverse_depth", **options)
     assert report.counts["scored"] == 4 and report.about["kind"] == "inverse_depth"
 
 
@@ -188,11 +187,11 @@ def test_the_real_moge(tmp_path):
     torch.manual_seed(0)
     network = v2.MoGeModel(**config).eval()
     torch.save({"model_config": config, "model": network.state_dict()}, tmp_path / "tiny.pt")
-    loaded = load_model(f"moge:{tmp_path / 'tiny.pt'}", size="70x98")
+    loaded = DepthModel.from_pretrained(f"moge:{tmp_path / 'tiny.pt'}", size="70x98")
     pixels = torch.rand(2, 3, 70, 98)
     expected = network.infer(pixels, apply_mask=False, use_fp16=False)["depth"]
-    torch.testing.assert_close(predict_depth(loaded.model, pixels), expected)
-    assert loaded.model.config.depth_estimation_type == "metric"
+    torch.testing.assert_close(loaded.predict(pixels), expected)
+    assert loaded.millimeters_per_unit == 1000
 
 
 def test_the_real_depth_anything_3(tmp_path):
@@ -200,8 +199,8 @@ def test_the_real_depth_anything_3(tmp_path):
     torch.manual_seed(0)
     network = api.DepthAnything3(model_name="da3-small").eval()
     network.save_pretrained(tmp_path)
-    loaded = load_model(f"da3:{tmp_path}", size="70x98")
+    loaded = DepthModel.from_pretrained(f"da3:{tmp_path}", size="70x98")
     pixels = torch.rand(2, 3, 70, 98)
     with torch.no_grad():
         expected = torch.stack([network.model(image[None, None])["depth"][0, 0] for image in pixels])
-    torch.testing.assert_close(predict_depth(loaded.model, pixels), expected)
+    torch.testing.assert_close(loaded.predict(pixels), expected)

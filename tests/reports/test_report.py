@@ -19,8 +19,8 @@ from huggingface_hub import ModelCard
 from PIL import Image
 
 from gift_peft import cli
-from gift_peft.evaluation.results import GiftIReport
-from gift_peft.evaluation.verb import run_booster, run_evaluation
+from gift_peft.evaluation.results import Report
+from gift_peft.evaluation.verb import run_evaluation
 from gift_peft.reports.ablation import ablation_table, is_ablation
 from gift_peft.reports.report import notable_observations, run_report
 from gift_peft.reports.saved_run import SavedRun, read_run, run_names
@@ -76,7 +76,7 @@ def test_one_command_from_a_run_to_everything(run_folder, tree, capsys):
     linked = re.findall(r"\]\(([^)]+)\)", text)
     assert {f"{name}.png" for name in names} | {"compare.html", "model_card.md"} == set(linked)
     assert all((folder / link).exists() for link in linked)
-    report = GiftIReport.load(run_folder / "evaluation")
+    report = Report.load(run_folder / "evaluation")
     rows = list(csv.DictReader(io.StringIO((folder / "tables" / "gift-i-proxy.csv").read_text())))
     assert float(rows[0]["ToM RMSE"]) == report.base["tom"]["rmse"]
     assert float(rows[1]["All delta1 %"]) == report.summary["all"]["delta1"]
@@ -94,7 +94,7 @@ def test_one_command_from_a_run_to_everything(run_folder, tree, capsys):
 def test_the_card_of_a_run_has_its_evaluation(run_folder, base_dir, tree):
     run_report([run_folder], card=True, panels=0)
     card = ModelCard.load(run_folder / "report" / "model_card.md")
-    report = GiftIReport.load(run_folder / "evaluation")
+    report = Report.load(run_folder / "evaluation")
     measured = {result.metric_type: result.metric_value for result in card.data.eval_results}
     assert measured["gce"] == pytest.approx(report.gce["adapted"], abs=1e-6)
     assert measured["other_rmse"] == pytest.approx(report.summary["other"]["rmse"], abs=1e-6)
@@ -112,7 +112,7 @@ def test_an_evaluation_of_another_adapter_is_not_on_the_card(run_folder, base_di
     run_report([run_folder], card=run_folder / "card.md", panels=0)
     results = ModelCard.load(run_folder / "card.md").data.eval_results
     assert [result.metric_type for result in results].count("gce") == 1
-    whole = GiftIReport.load(run_folder / "evaluation")
+    whole = Report.load(run_folder / "evaluation")
     assert results[0].metric_value == pytest.approx(whole.gce["adapted"], abs=1e-6)
     assert "(adapter scale 0.5) + GIFT" in (run_folder / "report" / "report.md").read_text()
 
@@ -313,7 +313,9 @@ def test_booster_has_its_own_tables_and_pictures(run_folder, base_dir, tmp_path,
     write_root(tmp_path / "booster", scenes=3)
     shutil.rmtree(run_folder / "evaluation")
     options = {"kind": "inverse_depth", "resize": 0.5, "progress": False}
-    run_booster(tmp_path / "booster", base_dir, run_folder / "adapter", out=run_folder / "booster", **options)
+    run_evaluation(
+        base_dir, None, run_folder / "adapter", booster=tmp_path / "booster", out=run_folder / "booster", **options
+    )
     run_report([run_folder], card=True)
     folder = run_folder / "report"
     assert "not in it" not in capsys.readouterr().out

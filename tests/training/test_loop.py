@@ -16,7 +16,7 @@ from transformers import AutoModelForDepthEstimation
 from gift_peft import evaluate_booster, get_gift_model
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.loader import PreparedGroups, epoch_order
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
+from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.losses import geometry_consistency_error
 from gift_peft.training import GiftTrainingArguments, loop, train
 

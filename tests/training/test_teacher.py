@@ -19,7 +19,7 @@ from gift_peft.dataset.proxies import read_header
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.models.identity import teacher_id
-from gift_peft.models.loading import predict_depth
+from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import to_pixel_values
 from gift_peft.training import teacher
 from gift_peft.training.teacher import make_proxies
@@ -45,13 +45,14 @@ def test_prediction_is_float32_in_batches_of_two(model):
         lambda _, args, kwargs: calls.append(len(kwargs["pixel_values"])), with_kwargs=True
     )
     with torch.autocast("cpu", torch.bfloat16):
-        proxies = predict_depth(model, pixels)
+        proxies = DepthModel(model).predict(pixels)
     assert calls == [2, 2, 1]
     assert proxies.dtype == torch.float32 and proxies.shape == (5, *SIZE) and not proxies.requires_grad
     with torch.no_grad():
         expected = torch.cat([model(pixel_values=pixels[i : i + 2]).predicted_depth for i in (0, 2, 4)])
     assert torch.equal(proxies, expected)
-    assert torch.equal(predict_depth(lambda_model(model), pixels), expected)  # a model that returns the tensor itself
+    bare = lambda_model(model)  # returns the tensor itself
+    assert torch.equal(DepthModel(bare).predict(pixels), expected)
 
 
 def lambda_model(model):
@@ -73,12 +74,12 @@ def test_proxies_are_the_models_predictions(raw_tree, base_dir, model):
     for split in ("train", "validation"):
         for row in load_gift_i(raw_tree, split, teacher=base_dir, size=SIZE):
             pixels = to_pixel_values(row["images"], tiny_processor(), SIZE)
-            assert torch.equal(row["proxies"], predict_depth(model, pixels))
+            assert torch.equal(row["proxies"], DepthModel(model).predict(pixels))
             if split == "train":
                 assert row["reference_proxy"] is None
             else:
                 pixels = to_pixel_values([row["reference"]], tiny_processor(), SIZE)
-                assert torch.equal(row["reference_proxy"], predict_depth(model, pixels)[0])
+                assert torch.equal(row["reference_proxy"], DepthModel(model).predict(pixels)[0])
             group = collate_group(row, tiny_processor(), SIZE)
             assert group.target.shape == group.mask.shape and group.target.dtype == torch.float32
     header = read_header(folder / "validation/scene_100.safetensors")
@@ -144,7 +145,7 @@ def test_finished_groups_are_kept(raw_tree, base_dir, monkeypatch):
     lost.unlink()
     asked = []
     predict = teacher._predict_row
-    monkeypatch.setattr(teacher, "_predict_row", lambda *args: asked.append(args[2].group_id) or predict(*args))
+    monkeypatch.setattr(teacher, "_predict_row", lambda *args: asked.append(args[1].group_id) or predict(*args))
     make_proxies(base_dir, raw_tree, size=SIZE)
     assert asked == ["scene_1"] and files(folder) == before
     assert all(path.stat().st_mtime_ns == time for path, time in times.items() if path != lost)

@@ -16,7 +16,7 @@ from pretrain_base import SIZE, load, score
 from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
 from gift_peft import align, depth_metrics, evaluate_gift_i, load_gift_i
-from gift_peft.evaluation.scoring import resize_prediction
+from gift_peft.evaluation.alignment import resize_prediction
 from gift_peft.models.pixels import to_pixel_values
 
 

@@ -21,6 +21,7 @@ from peft.tuners.lora import LoraLayer
 
 from gift_peft.adapters.scale import active_lora, active_saved_modules
 from gift_peft.files import is_hub_id, jsonable, reason, whole_folder
+from gift_peft.rules import KINDS
 
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
@@ -69,7 +70,7 @@ def save_adapter(
         _write_json(temporary / ADAPTER_CONFIG, config)
         if processor is not None:
             # Not save_pretrained: it would put the code of VGGT's and Metric3D's processors beside the adapter.
-            _at_size(processor, size).to_json_file(temporary / PROCESSOR_CONFIG)
+            processor_at_size(processor, size).to_json_file(temporary / PROCESSOR_CONFIG)
         _write_json(temporary / GIFT, _gift_json(gift, size))
         # Last: PEFT writes a README of its own, which names a local base path.
         (temporary / "README.md").write_text(card or _minimal_card(hub_base), encoding="utf-8")
@@ -108,7 +109,7 @@ def _check_replaceable(folder: Path) -> None:
         )
 
 
-def _at_size(processor: Any, size: tuple[int, int] | None) -> Any:
+def processor_at_size(processor: Any, size: tuple[int, int] | None) -> Any:
     """A copy of the image processor that resizes every image to exactly (height, width)."""
     if size is None:
         return processor
@@ -117,6 +118,8 @@ def _at_size(processor: Any, size: tuple[int, int] | None) -> Any:
     processor.size = {"height": size[0], "width": size[1]}
     if hasattr(processor, "keep_aspect_ratio"):
         processor.keep_aspect_ratio = False
+    if getattr(processor, "do_pad", False):
+        processor.do_pad = False
     return processor
 
 
@@ -173,7 +176,7 @@ def read_adapter_config(adapter: str | Path) -> LoraConfig:
 def read_gift(adapter: str | Path) -> dict[str, Any]:
     """An adapter folder's gift.json; empty without one (an adapter that PEFT alone saved, or one on the hub)."""
     content = _read_object(adapter, GIFT) if (Path(adapter) / GIFT).is_file() else {}
-    for name, values in (("base_revision", None), ("kind", ("depth", "inverse_depth"))):
+    for name, values in (("base_revision", None), ("kind", KINDS)):
         value = content.get(name)
         if value is not None and (not isinstance(value, str) or (values and value not in values)):
             raise ValueError(f"adapter {adapter}: damaged {GIFT} ({name} cannot be {str(value)[:80]!r})")

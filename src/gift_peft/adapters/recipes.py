@@ -18,9 +18,9 @@ from torch import nn
 
 from gift_peft.adapters.scale import check_lora_config
 from gift_peft.group_step import dropout_rates
+from gift_peft.rules import KINDS
 
 HEADS = ("full", "lora", "none")
-KINDS = ("depth", "inverse_depth")
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from pathlib import Path
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.rows import parsed
 from gift_peft.demo.validation_page import validation_page
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
-from gift_peft.evaluation.results import GiftIReport
+from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.files import whole_folder, write_whole
-from gift_peft.models.loading import load_model
+from gift_peft.models.loading import DepthModel
 from gift_peft.reports.figures import before_after
 from gift_peft.reports.model_card import run_length
 from gift_peft.reports.panels import group_panels
@@ -41,7 +41,7 @@ SETTINGS += ["--micro_batch_size=4"]
 
 def run_demo(
     out: str | Path = "demo", overwrite_output_dir: bool = False, seed: int = 0, extra: Sequence[str] = ()
-) -> dict[str, GiftIReport]:
+) -> dict[str, Report]:
     """Trains, evaluates and writes `out`; returns the reports against the proxy and against true depth.
 
     Args:
@@ -76,22 +76,15 @@ def run_demo(
     if result.signal:
         raise KeyboardInterrupt
 
-    loaded = load_model(out / "base", out / "adapter")
+    model = DepthModel.from_pretrained(out / "base", out / "adapter")
     groups = load_gift_i(out / "gift-i", "validation")
     reports = {}
     for reference in ("proxy", "depth"):
-        report = evaluate_gift_i(
-            groups,
-            loaded.model,
-            reference=reference,
-            processor=loaded.processor,
-            size=loaded.size,
-            kind=loaded.kind,
-        )
+        report = evaluate_gift_i(groups, model, reference=reference)
         report.about = {"base": f"{out}/base", "adapter": f"{out}/adapter", "dataset": f"{out}/gift-i", "seed": seed}
         report.save(out / f"evaluation-{reference}")
         reports[reference] = report
-    before_after(_panels(groups, reports["depth"], loaded), out / "before_after.png")
+    before_after(_panels(groups, reports["depth"], model), out / "before_after.png")
     write_whole(out / "validation.html", validation_page(parsed(groups)))
     write_whole(out / "report.md", _markdown(reports, args))
     _print_summary(reports, out)
@@ -109,33 +102,22 @@ def _copy_embedded(name: str, destination: Path) -> None:
                 os.replace(destination / "proxies", place / "proxies")
 
 
-def _scored(report: GiftIReport, kind: str) -> list[dict]:
+def _scored(report: Report, kind: str) -> list[dict]:
     """The rows of one kind of target that have metrics."""
     return [row for row in report.rows if row["group_id"].startswith(kind) and not row["skipped"]]
 
 
-def _panels(groups, report: GiftIReport, loaded) -> list:
+def _panels(groups, report: Report, model: DepthModel) -> list:
     """For each kind of target the observation on which the base errs most inside it: the worst hallucination."""
-    rows = {
-        row["group_id"]: (index, row) for index, row in enumerate(groups.select_columns(["group_id", "image_names"]))
-    }
+    rows = {group_id: index for index, group_id in enumerate(groups.select_columns(["group_id"])["group_id"])}
     panels = []
     for kind, label in KINDS.items():
-        own = _scored(report, kind)
-        worst = max(own, key=lambda row: row["base"]["tom"]["rmse"])
-        index, names = rows[worst["group_id"]]
-        panels += group_panels(
-            groups[index],
-            {names["image_names"].index(worst["image"]): label},
-            loaded.model,
-            processor=loaded.processor,
-            size=loaded.size,
-            kind=loaded.kind,
-        )
+        worst = max(_scored(report, kind), key=lambda row: row["base"]["tom"]["rmse"])
+        panels += group_panels(groups[rows[worst["group_id"]]], {worst["image"]: label}, model)
     return panels
 
 
-def _by_kind(report: GiftIReport) -> list[tuple[str, float, float]]:
+def _by_kind(report: Report) -> list[tuple[str, float, float]]:
     """(kind, base, adapted): mean RMSE inside the target per kind of target."""
     lines = []
     for kind, label in KINDS.items():
@@ -145,7 +127,7 @@ def _by_kind(report: GiftIReport) -> list[tuple[str, float, float]]:
     return lines
 
 
-def _markdown(reports: dict[str, GiftIReport], args) -> str:
+def _markdown(reports: dict[str, Report], args) -> str:
     kinds = "\n".join(
         f"| {label} | {base:.0f} | {adapted:.0f} | {100 * (adapted / base - 1):+.1f} % |"
         for label, base, adapted in _by_kind(reports["depth"])
@@ -178,7 +160,7 @@ RMSE inside the target, per kind (mm):
 """
 
 
-def _print_summary(reports: dict[str, GiftIReport], out: Path) -> None:
+def _print_summary(reports: dict[str, Report], out: Path) -> None:
     color = sys.stdout.isatty() and "NO_COLOR" not in os.environ
     for reference, title in (
         ("proxy", "Against the base's prediction on the treated reference"),

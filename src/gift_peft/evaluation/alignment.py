@@ -9,11 +9,13 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
 from gift_peft.evaluation.fitting import fit, nearest_to_grid
-from gift_peft.evaluation.protocols import KINDS, Protocol, get_protocol
+from gift_peft.evaluation.protocols import Protocol, get_protocol
+from gift_peft.rules import KINDS
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,14 @@ def to_numpy(value: Any, dtype: type) -> np.ndarray:
         value = value.detach().cpu()
         value = (value.double() if value.is_floating_point() else value).numpy()
     return np.asarray(value).astype(dtype, copy=False)
+
+
+def resize_prediction(prediction: Any, size: tuple[int, int]) -> np.ndarray:
+    """(h,w) numpy or torch to the reference's (H,W) float64, by OpenCV's bilinear interpolation where they differ."""
+    prediction = to_numpy(prediction, np.float64)
+    if prediction.shape != tuple(size):
+        prediction = cv2.resize(prediction, size[::-1], interpolation=cv2.INTER_LINEAR)
+    return prediction
 
 
 def like(value: np.ndarray, example: Any) -> Any:
@@ -72,8 +82,7 @@ def align(
     Args:
         prediction (`np.ndarray` or `torch.Tensor`): (H,W) or (B,H,W) in the model's native units; finite everywhere.
         reference: same shape; depth, in mm where the protocol clips (its range is in mm); anything in `native`.
-        valid: same shape, bool: the pixels of the fit (so it is the caller who leaves out the target, where the
-            protocol's `fit_region` is `other`). Those without a finite reference > 0 are left out.
+        valid: same shape, bool: the pixels of the fit. Those without a finite reference > 0 are left out.
         protocol (`str` or `Protocol`): see `PROTOCOLS`.
         kind (`str`): what the prediction is, `depth` or `inverse_depth`.
 
@@ -85,7 +94,7 @@ def align(
     rules = get_protocol(protocol)
     if kind not in KINDS:
         raise ValueError(f"unknown kind {kind!r}: choose one of {', '.join(KINDS)}")
-    if rules.space == "depth" and rules.dof == "none" and kind == "inverse_depth":
+    if rules.space == "depth" and not rules.fits_scale and kind == "inverse_depth":
         raise ValueError(f"protocol {rules.name} fits nothing, so it compares depth with depth; this is inverse depth")
     predictions, references = to_numpy(prediction, np.float64), to_numpy(reference, np.float64)
     valids = check_mask("valid", valid)
@@ -106,28 +115,30 @@ def _align_image(
     prediction, reference, valid, rules: Protocol, kind: str
 ) -> tuple[np.ndarray, float, float, int, int]:
     usable = valid & known(reference)
-    inverts, given_depth = rules.inverts(kind), kind == "depth"
-    if inverts and given_depth:
-        # A depth of zero or less has no (finite) inverse: it stays out of the fit and ends up at the near end.
-        positive = prediction > np.finfo(np.float64).tiny
+    inverts = rules.inverts(kind)
+    # A depth of zero or less has no (finite) inverse: it stays out of the fit and ends up at the near end.
+    positive = prediction > np.finfo(np.float64).tiny if inverts and kind == "depth" else None
+    if positive is not None:
         usable &= positive
         prediction = np.divide(1, prediction, out=np.zeros(prediction.shape), where=positive)
     farthest = reference[usable].max() if rules.floor == "ref_max" and inverts and usable.any() else None
-    loss = rules.loss_for(kind)
-    pixels = nearest_to_grid(usable) if loss == "l1_rel" else usable
-    target = reference[pixels]
-    if inverts:
-        np.reciprocal(target, out=target)
-    scale, shift = fit(prediction[pixels], target, rules.dof, loss)
+    scale, shift = 1.0, 0.0
+    if rules.fits_scale:
+        loss = rules.loss_for(kind)
+        pixels = nearest_to_grid(usable) if loss == "l1_rel" else usable
+        target = reference[pixels]
+        if inverts:
+            np.reciprocal(target, out=target)
+        scale, shift = fit(prediction[pixels], target, loss)
     if rules.space == "depth":
         _tell_fit_to_depth(rules, kind, scale)
     aligned = scale * prediction + shift
-    if inverts and given_depth:
+    if positive is not None:
         aligned[~positive] = np.inf
     num_nonpositive = int(np.count_nonzero(aligned <= 0))
     num_clipped = 0
     if inverts:
-        if given_depth:
+        if positive is not None:
             num_nonpositive += int(np.count_nonzero(~positive))
         if farthest is not None:
             low = aligned < 1 / farthest

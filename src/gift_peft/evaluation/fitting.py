@@ -1,67 +1,35 @@
 """Scale and shift of flat float64 arrays under the losses that a `Protocol` names.
 
 Least squares is a closed form on centred data. The weighted L1 fit is exact: for one scale the best shift is a
-weighted median, what is left is convex in the scale and is bisected by its subgradient. Huber is reweighted least
-squares.
+weighted median, what is left is convex in the scale and is bisected by its subgradient.
 """
 
 import numpy as np
 
 SUBSAMPLE = 64  # MoGe's grid for L1 fits: bounds their cost whatever the picture's size
-HUBER = 1.345 * 1.4826  # 95 % efficiency under normal noise, times what makes a MAD a standard deviation
 
 
 class DegenerateFitError(ValueError):
     """No scale and shift exist, as for fewer than two distinct values."""
 
 
-def fit(prediction: np.ndarray, target: np.ndarray, dof: str, loss: str) -> tuple[float, float]:
+def fit(prediction: np.ndarray, target: np.ndarray, loss: str) -> tuple[float, float]:
     """Scale and shift that bring `prediction` to `target`, both (K,) float64.
 
-    Args:
-        prediction, target: of the pixels of the fit.
-        dof, loss (`str`): as in `Protocol`. `l1_rel` takes target > 0.
-
-    Raises:
-        DegenerateFitError: fewer than two distinct predictions (`scale_shift`), only zeros (`scale`), a median of zero
-            (`median`), no pixel at all (`shift`).
+    `loss` is `l2`, or `l1_rel`, which takes target > 0. Raises DegenerateFitError for fewer than two distinct
+    predictions.
     """
-    if dof == "none":
-        return 1.0, 0.0
-    _check(prediction, dof)
-    if dof == "median":
-        return float(np.median(target) / np.median(prediction)), 0.0
-    if loss == "l1_rel":
-        return _fit_l1(prediction, target, 1 / target, dof)
-    if loss == "huber":
-        return _fit_huber(prediction, target, dof)
-    return _fit_l2(prediction, target, dof)
-
-
-def _check(prediction: np.ndarray, dof: str) -> None:
     tiny = np.finfo(np.float64).tiny / np.finfo(np.float64).eps  # below it, differences are subnormal noise
-    pixels = f"in the {prediction.size} pixels of the fit"
-    if dof == "scale_shift" and (not prediction.size or np.ptp(prediction) < tiny):
+    if not prediction.size or np.ptp(prediction) < tiny:
         raise DegenerateFitError(
-            f"cannot fit scale and shift: the prediction has fewer than two distinct values {pixels}"
+            "cannot fit scale and shift: the prediction has fewer than two distinct values in the "
+            f"{prediction.size} pixels of the fit"
         )
-    if not prediction.size:
-        raise DegenerateFitError(f"cannot fit {dof}: there is no pixel to fit")
-    if dof == "scale" and np.abs(prediction).max() < tiny:
-        raise DegenerateFitError(f"cannot fit scale: the prediction is zero {pixels}")
-    if dof == "median" and np.abs(np.median(prediction)) < tiny:
-        raise DegenerateFitError(f"cannot fit median: the prediction's median is zero {pixels}")
+    return _fit_l1(prediction, target, 1 / target) if loss == "l1_rel" else _fit_l2(prediction, target)
 
 
-def _fit_l2(prediction: np.ndarray, target: np.ndarray, dof: str, weight=None) -> tuple[float, float]:
+def _fit_l2(prediction: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> tuple[float, float]:
     """Least squares, weighted if `weight` (K,) is given."""
-    if dof == "scale":
-        unit = np.abs(prediction).max()
-        scaled = prediction / unit
-        weighted = scaled if weight is None else scaled * weight
-        return float(weighted @ target / (weighted @ scaled) / unit), 0.0
-    if dof == "shift":
-        return 1.0, float(np.average(target - prediction, weights=weight))
     # Centred and divided by the spread, so that the normal equations lose no digits to a large offset or tiny units.
     spread = float(np.ptp(prediction))
     mean, target_mean = np.average(prediction, weights=weight), np.average(target, weights=weight)
@@ -71,30 +39,8 @@ def _fit_l2(prediction: np.ndarray, target: np.ndarray, dof: str, weight=None) -
     return scale, float(target_mean - scale * mean)
 
 
-def _fit_huber(prediction: np.ndarray, target: np.ndarray, dof: str) -> tuple[float, float]:
-    scale, shift = _fit_l2(prediction, target, dof)
-    residual = target - scale * prediction - shift
-    threshold = HUBER * float(np.median(np.abs(residual - np.median(residual))))
-    if threshold <= 1e-12 * float(np.abs(target).max()):  # nothing but rounding is left
-        return scale, shift
-    for _ in range(500):
-        distance = np.abs(target - scale * prediction - shift)
-        weight = threshold / np.maximum(distance, threshold)
-        previous = scale, shift
-        scale, shift = _fit_l2(prediction, target, dof, weight)
-        change = np.abs((scale - previous[0]) * prediction + shift - previous[1]).max()
-        if change <= 1e-10 * threshold:
-            break
-    return scale, shift
-
-
-def _fit_l1(prediction: np.ndarray, target: np.ndarray, weight: np.ndarray, dof: str) -> tuple[float, float]:
+def _fit_l1(prediction: np.ndarray, target: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     """argmin of sum weight |s d + t - y|, exactly."""
-    if dof == "scale":
-        used = prediction != 0
-        return _weighted_median(target[used] / prediction[used], weight[used] * np.abs(prediction[used])), 0.0
-    if dof == "shift":
-        return 1.0, _weighted_median(target - prediction, weight)
     mean, spread = prediction.mean(), float(np.ptp(prediction))
     centred = (prediction - mean) / spread
     slope = _l1_slope(centred, target, weight)
@@ -104,7 +50,7 @@ def _fit_l1(prediction: np.ndarray, target: np.ndarray, weight: np.ndarray, dof:
 
 def _l1_slope(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> float:
     """The slope of the best line; x has a spread of 1."""
-    slope, _ = _fit_l2(x, y, "scale_shift", weight)
+    slope, _ = _fit_l2(x, y, weight)
     side = _slope_side(slope, x, y, weight)
     if side == 0:
         return slope

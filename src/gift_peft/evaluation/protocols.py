@@ -7,50 +7,39 @@ are what published evaluators do, so that numbers can be compared with theirs.
 
 from dataclasses import asdict, dataclass
 
-KINDS = ("depth", "inverse_depth")
+from gift_peft.rules import KINDS
+
 # A choice that nothing computes must not stand under a table.
 CHOICES = {
     "space": ("auto", "depth", "inverse", "native"),
-    "dof": ("scale_shift", "scale", "shift", "median", "none"),
-    "loss": ("l2", "l1_rel", "huber"),
-    "inverse_loss": (None, "l2", "l1_rel", "huber"),
-    "fit_region": ("valid", "other"),
+    "dof": ("scale_shift", "none"),
+    "loss": ("l2", "l1_rel"),
+    "inverse_loss": (None, "l2", "l1_rel"),
     "floor": (None, "ref_max"),
     "nonpositive": ("far", "near"),
-    "aggregation": ("image", "pixel", "group"),
     "expects": (None, *KINDS),
-}
-FITS = {
-    "scale_shift": "scale and shift",
-    "scale": "scale alone",
-    "shift": "shift alone",
-    "median": "scale of the medians",
-    "none": "no alignment",
 }
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """The choices behind one number.
+    """The choices behind one number. What is fitted is fitted over all valid pixels, target and surroundings alike;
+    a mean is over images, of each image's own metric.
 
     Args:
         name (`str`): key in `PROTOCOLS`.
         space (`str`): where the fit happens. `auto`: where the prediction lives, so an inverse-depth prediction is
             fitted to 1/reference and inverted. `depth`: depth, whatever the prediction is. `inverse`: 1/reference; a
             depth prediction is inverted first. `native`: prediction and reference share a space, nothing is inverted.
-        dof (`str`): what is fitted: `scale_shift`, `scale`, `shift`, `median` (scale = median(y) / median(d)), `none`.
+        dof (`str`): what is fitted: `scale_shift`, or `none`.
         loss (`str`): the fit's loss. `l2`: least squares, in closed form. `l1_rel`: sum |s d + t - y| / y, exactly, on
-            the valid pixels nearest to the centres of a 64x64 grid. `huber`: threshold 1.345 robust standard
-            deviations of the least-squares residuals. Of no meaning to `median` and `none`.
+            the valid pixels nearest to the centres of a 64x64 grid.
         inverse_loss (`str`, *optional*): the loss where the fit is in inverse depth; default `loss`.
-        fit_region (`str`): `valid`: all valid pixels, target and surroundings alike; `other`: without the target.
         clip (`tuple[float, float]`, *optional*): working range in the reference's unit, applied after alignment and
             inversion.
         floor (`str`, *optional*): `ref_max`: an aligned inverse depth is raised to that of the farthest reference.
         nonpositive (`str`): what an aligned inverse depth below 0 means: `far`, the upper end of `clip`, or `near`,
             the lower one. (0 is infinitely far in both.)
-        aggregation (`str`): `image`: the mean over images of each image's own metric; `pixel`: over all pixels
-            together; `group`: the mean over groups (scenes) of the group's image mean.
         resolution (`float`, *optional*): metrics are taken on the reference's grid times this factor; None leaves it
             to the evaluation, whose report states it.
         unit (`str`): unit of the reference that `clip` is meant for, `mm` or `native`.
@@ -66,11 +55,9 @@ class Protocol:
     dof: str = "scale_shift"
     loss: str = "l2"
     inverse_loss: str | None = None
-    fit_region: str = "valid"
     clip: tuple[float, float] | None = None
     floor: str | None = None
     nonpositive: str = "far"
-    aggregation: str = "image"
     resolution: float | None = None
     unit: str = "mm"
     expects: str | None = None
@@ -89,6 +76,11 @@ class Protocol:
                 f"protocol {self.name!r}: inverting may give an infinite depth; name a clip range or floor='ref_max'"
             )
 
+    @property
+    def fits_scale(self) -> bool:
+        """Whether a prediction may be in any unit."""
+        return self.dof != "none"
+
     def inverts(self, kind: str) -> bool:
         """Whether a prediction of this kind is aligned in inverse depth."""
         return self.space == "inverse" or (self.space == "auto" and kind == "inverse_depth")
@@ -99,18 +91,15 @@ class Protocol:
 
     def describe(self) -> str:
         """One line with every choice, as it stands under a table."""
-        fit = FITS[self.dof]
-        if self.dof not in ("median", "none"):
-            other = f" ({self.inverse_loss} in inverse depth)" if self.inverse_loss else ""
-            fit = f"{fit} by {self.loss}{other}"
-        over = "" if self.dof == "none" else f" over {self.fit_region} pixels"
+        other = f" ({self.inverse_loss} in inverse depth)" if self.inverse_loss else ""
+        fit = f"scale and shift by {self.loss}{other} over valid pixels" if self.fits_scale else "no alignment"
         clip = "no clipping" if self.clip is None else f"clip {self.clip[0]:g}..{self.clip[1]:g} {self.unit}"
-        parts = [f"{self.name}: {fit}{over}", f"space {self.space}", clip]
+        parts = [f"{self.name}: {fit}", f"space {self.space}", clip]
         if self.floor:
             parts.append("inverse depth at least that of the farthest reference")
         if self.nonpositive == "near":
             parts.append("negative inverse depth is near")
-        parts.append(f"{self.aggregation} mean")
+        parts.append("image mean")
         if self.resolution is not None:
             parts.append(f"resolution x{self.resolution:g}")
         return ", ".join(parts)

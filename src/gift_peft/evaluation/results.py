@@ -1,6 +1,6 @@
 """What an evaluation leaves behind: per-image rows, their means per region, GCE, the collapse alarm, and the files.
 
-Summaries are means over images, pixels or groups (NaN left out and counted), whatever the order of the rows.
+Summaries are means over images (NaN left out and counted), whatever the order of the rows.
 """
 
 import json
@@ -13,20 +13,71 @@ from typing import Any
 import numpy as np
 
 from gift_peft.evaluation.metrics import METRICS
+from gift_peft.evaluation.protocols import Protocol
 from gift_peft.files import jsonable, write_whole
 
 REGIONS = ("tom", "other", "all")
 COLLAPSE_RANGE = (0.5, 2.0)
 
 
+@dataclass(kw_only=True)
 class Report:
-    """What the reports have in common: their files. Subclasses are dataclasses with a field `rows`."""
+    """The result of `evaluate_gift_i` and `evaluate_booster`. Groups of Booster are its scenes.
 
-    rows: list[dict]
+    Args:
+        summary (`dict`): {region: {metric: mean over images}} of the evaluated model or predictions.
+        base (`dict`, *optional*): the same of the frozen model; equal to `summary` where that is what was evaluated.
+        consensus (`dict`, *optional*): on GIFT-I, `base` with the target replaced by the group median.
+        gce (`dict`): Eq. 7 inside the target, in native units: `base`, `adapted`, `base_normalized`,
+            `adapted_normalized` (None where that model was not run), `num_groups`, `num_skipped`. On Booster it says
+            how much a prediction changes with the light alone, and metrics.json calls it `illumination_gce`.
+        collapse (`dict`, *optional*): adapted/base ratios `target_mean_ratio` and `spread_ratio`, and `alarm`.
+        by_surface (`dict`): on GIFT-I, {surface: {`num_images` with a scored target, `summary`, `base`, `consensus`}}.
+        per_scene (`dict`): on Booster, {scene: {`num_images`, `num_scored`, `summary`, `base`}}.
+        counts (`dict`): `groups`, `images`, `scored`, `skipped`, `reasons` ({reason: images}), and
+            `without_tom`, `without_other`: scored images that have no known pixel in that region.
+        protocol (`dict`): the protocol's choices; `description` is the line under every table.
+        reference (`str`): `proxy` or `depth`.
+        adapted (`bool`): whether `summary` is of an adapted model, or of the base itself.
+        unit (`str`): of MAE and RMSE.
+        groups (`list[dict]`): GCE per group.
+        rows (`list[dict]`): one per image, see `evaluate_gift_i`.
+        about (`dict`): what was evaluated: on Booster `root`, `subset`, `resize`, `occlusion`, `tom_classes`, `kind`,
+            `official` (whether it was the complete official training set), and, where the caller knows, `base`,
+            `adapter`, `dataset`, `predictions`, ...
+        dataset (`str`): `gift-i` or `booster`.
+    """
+
+    summary: dict
+    base: dict | None
+    consensus: dict | None = None
+    gce: dict
+    collapse: dict | None
+    by_surface: dict = field(default_factory=dict)
+    per_scene: dict = field(default_factory=dict)
+    counts: dict
+    protocol: dict
+    reference: str = "depth"
+    adapted: bool
+    unit: str
+    groups: list[dict]
+    rows: list[dict] = field(repr=False)
+    about: dict = field(default_factory=dict)
+    dataset: str = "gift-i"
+
+    @property
+    def group_noun(self) -> str:
+        """What a group is called."""
+        return "scene" if self.dataset == "booster" else "group"
+
+    @property
+    def gce_name(self) -> str:
+        """What GCE is called: the reflected content of a Booster scene stays the same, only the light changes."""
+        return "illumination GCE" if self.dataset == "booster" else "GCE"
 
     def to_dict(self) -> dict:
         """Everything but the rows, in JSON types; NaN and infinity become None."""
-        return jsonable({item.name: getattr(self, item.name) for item in fields(self) if item.name != "rows"})
+        return jsonable({key: getattr(self, name) for name, key in _json_keys(self.dataset).items()})
 
     def save(self, folder: str | Path) -> Path:
         """Writes `metrics.json` and `rows.jsonl`, each at once or not at all; returns the folder."""
@@ -38,7 +89,10 @@ class Report:
 
     @classmethod
     def load(cls, folder: str | Path) -> "Report":
-        """A saved report; FileNotFoundError if the folder holds none, ValueError if it is one of another dataset."""
+        """What `gift-peft evaluate --out` left in a folder.
+
+        Raises FileNotFoundError if the folder holds no evaluation, ValueError if it is damaged.
+        """
         folder = Path(folder)
         for name in ("metrics.json", "rows.jsonl"):
             if not (folder / name).is_file():
@@ -47,21 +101,45 @@ class Report:
         rows = [_parse(path, line) for line in path.read_text(encoding="utf-8").splitlines()]
         path = folder / "metrics.json"
         values = _parse(path, path.read_text(encoding="utf-8"))
-        known = {item.name for item in fields(cls)} - {"rows"}
-        for names, verb in ((values.keys() - known, "has"), (known - values.keys(), "lacks")):
-            if names:
-                raise ValueError(f"{path} is no {cls.__name__}: it {verb} {', '.join(sorted(names))}")
-        return cls(rows=rows, **values)
+        dataset = "booster" if "illumination_gce" in values else "gift-i"
+        names = {key: name for name, key in _json_keys(dataset).items()}
+        for keys, verb in ((values.keys() - names.keys(), "has"), (names.keys() - values.keys(), "lacks")):
+            if keys:
+                raise ValueError(f"{path} is no evaluation: it {verb} {', '.join(sorted(keys))}")
+        return cls(rows=rows, dataset=dataset, **{names[key]: value for key, value in values.items()})
 
 
-def load_report(folder: str | Path) -> "GiftIReport | BoosterReport":
-    """The report that `gift-peft evaluate --out` left in a folder, of either dataset.
+def _json_keys(dataset: str) -> dict[str, str]:
+    """{field of a report: its key in metrics.json}, which has what the dataset has."""
+    booster = dataset == "booster"
+    absent = {"rows", "dataset", *(("reference", "consensus", "by_surface") if booster else ("per_scene",))}
+    keys = {item.name: item.name for item in fields(Report) if item.name not in absent}
+    return keys | ({"gce": "illumination_gce"} if booster else {})
 
-    Raises FileNotFoundError or ValueError where there is none.
-    """
-    path = Path(folder) / "metrics.json"
-    booster = path.is_file() and "illumination_gce" in _parse(path, path.read_text(encoding="utf-8"))
-    return (BoosterReport if booster else GiftIReport).load(folder)
+
+def make_report(
+    dataset: str, groups: list[dict], rows: list[dict], models: list[str], protocol: Protocol, reference: str
+) -> Report:
+    """The report of an evaluation's rows and the GCE of its groups."""
+    subject = "adapted" if "adapted" in models else "base"
+    booster = dataset == "booster"
+    return Report(
+        summary=summarize(rows, subject),
+        base=summarize(rows, "base") if "base" in models else None,
+        consensus=summarize(rows, "consensus") if "consensus" in models else None,
+        gce=summarize_gce(groups, models),
+        collapse=detect_collapse(rows) if {"base", "adapted"} <= set(models) else None,
+        by_surface={} if booster else _by_surface(rows, models, subject),
+        per_scene=_per_scene(groups, rows, models, subject) if booster else {},
+        counts=count_rows(rows, len(groups), subject),
+        protocol=protocol.to_dict() | {"description": protocol.describe()},
+        reference=reference,
+        adapted=subject == "adapted",
+        unit="native units" if reference == "proxy" else "mm",
+        groups=groups,
+        rows=rows,
+        dataset=dataset,
+    )
 
 
 def _parse(path: Path, text: str) -> dict:
@@ -74,113 +152,18 @@ def _parse(path: Path, text: str) -> dict:
     return values
 
 
-@dataclass
-class GiftIReport(Report):
-    """The result of `evaluate_gift_i`.
-
-    Args:
-        summary (`dict`): {region: {metric: mean over images}} of the evaluated model.
-        base (`dict`, *optional*): the same of the frozen model.
-        consensus (`dict`, *optional*): the same of the base with the target replaced by the group median.
-        gce (`dict`): `base`, `adapted`, `base_normalized`, `adapted_normalized` (None where that model was not run),
-            `num_groups`, `num_skipped`.
-        collapse (`dict`, *optional*): adapted/base ratios `target_mean_ratio` and `spread_ratio`, and `alarm`.
-        by_surface (`dict`): {surface: {`num_images` with a scored target, `summary`, `base`, `consensus`}}.
-        counts (`dict`): `groups`, `images`, `scored`, `skipped`, `reasons` ({reason: images}), and
-            `without_tom`, `without_other`: scored images that have no known pixel in that region.
-        protocol (`dict`): the protocol's choices; `description` is the line under every table.
-        reference (`str`): `proxy` or `depth`.
-        adapted (`bool`): whether `summary` is of an adapted model, or of the base itself.
-        unit (`str`): of MAE and RMSE.
-        groups (`list[dict]`): GCE per group.
-        rows (`list[dict]`): one per observation, see `evaluate_gift_i`.
-        about (`dict`): what was evaluated (base, adapter, dataset, ...), where the caller knows.
-    """
-
-    summary: dict
-    base: dict | None
-    consensus: dict | None
-    gce: dict
-    collapse: dict | None
-    by_surface: dict
-    counts: dict
-    protocol: dict
-    reference: str
-    adapted: bool
-    unit: str
-    groups: list[dict]
-    rows: list[dict] = field(repr=False)
-    about: dict = field(default_factory=dict)
-
-
-@dataclass
-class BoosterReport(Report):
-    """The result of `evaluate_booster`; MAE and RMSE in mm. Groups are scenes: one pose and geometry, several lights.
-
-    Args:
-        summary (`dict`): {region: {metric: mean as the protocol aggregates}} of the evaluated model or predictions.
-        base (`dict`, *optional*): the same of the frozen model; equal to `summary` where that is what was evaluated.
-        illumination_gce (`dict`): Eq. 7 over a scene's images inside ToM, in native units: how much a prediction
-            changes with the light alone. Not GIFT-I's GCE, whose reflected content changes. `base`, `adapted`,
-            `base_normalized`, `adapted_normalized` (None where that model was not run), `num_groups`, `num_skipped`.
-        collapse (`dict`, *optional*): adapted/base ratios `target_mean_ratio` and `spread_ratio`, and `alarm`.
-        per_scene (`dict`): {scene: {`num_images`, `num_scored`, `summary`, `base`}}.
-        counts (`dict`): `groups` (scenes), `images`, `scored`, `skipped`, `reasons` ({reason: images}), and
-            `without_tom`, `without_other`: scored images that have no known pixel in that region.
-        protocol (`dict`): the protocol's choices at the resolution used; `description` is the line under every table.
-        adapted (`bool`): whether `summary` is of an adapted model.
-        groups (`list[dict]`): illumination GCE per scene.
-        rows (`list[dict]`): one per image, see `evaluate_booster`.
-        about (`dict`): `root`, `subset`, `resize`, `occlusion`, `tom_classes`, `kind`, `official` (whether it was the
-            complete official training set), and, where the caller knows, `predictions`, `base`, `adapter`, ...
-    """
-
-    summary: dict
-    base: dict | None
-    illumination_gce: dict
-    collapse: dict | None
-    per_scene: dict
-    counts: dict
-    protocol: dict
-    adapted: bool
-    unit: str
-    groups: list[dict]
-    rows: list[dict] = field(repr=False)
-    about: dict = field(default_factory=dict)
-
-
 def mean(values: list[float]) -> float:
     """Mean of the values that are not NaN; NaN if none is."""
     values = [value for value in values if not math.isnan(value)]
     return math.fsum(values) / len(values) if values else math.nan
 
 
-def summarize(rows: list[dict], model: str, aggregation: str = "image") -> dict:
-    """{region: {metric: mean}} of one of `base`, `adapted`, `consensus`, over images, pixels or groups."""
-    if aggregation == "group":
-        groups = [
-            summarize([row for row in rows if row["group_id"] == group_id], model)
-            for group_id in dict.fromkeys(row["group_id"] for row in rows)
-        ]
-        return {region: {m: mean([group[region][m] for group in groups]) for m in METRICS} for region in REGIONS}
-    average = pooled_mean if aggregation == "pixel" else image_mean
-    return {region: {metric: average(rows, model, region, metric) for metric in METRICS} for region in REGIONS}
-
-
-def image_mean(rows: list[dict], model: str, region: str, metric: str) -> float:
-    """The mean over images of each image's own metric."""
-    return mean([row[model][region][metric] for row in rows])
-
-
-def pooled_mean(rows: list[dict], model: str, region: str, metric: str) -> float:
-    """The metric of all the rows' known pixels of the region (`pixels`) taken together, from the images' own."""
-    known = [(row[model][region][metric], row["pixels"][region]) for row in rows]
-    known = [(value, pixels) for value, pixels in known if not math.isnan(value)]
-    if not known:
-        return math.nan
-    power = 2 if metric == "rmse" else 1  # a root does not average, its square does
-    total = math.fsum(pixels * value**power for value, pixels in known)
-    return (total / sum(pixels for _, pixels in known)) ** (1 / power)
+def summarize(rows: list[dict], model: str) -> dict:
+    """{region: {metric: mean over images}} of one of `base`, `adapted`, `consensus`."""
+    return {
+        region: {metric: mean([row[model][region][metric] for row in rows]) for metric in METRICS}
+        for region in REGIONS
+    }
 
 
 def summarize_gce(groups: list[dict], models: list[str]) -> dict:
@@ -236,14 +219,25 @@ def count_scored(rows: list[dict], subject: str, region: str) -> int:
     return sum(not row["skipped"] and not math.isnan(row[subject][region]["mae"]) for row in rows)
 
 
-def by_surface(rows: list[dict], models: list[str], subject: str, aggregation: str = "image") -> dict:
+def _by_surface(rows: list[dict], models: list[str], subject: str) -> dict:
     """The summaries per surface kind, `unknown` where the group states none."""
-    surfaces = sorted({row["surface"] or "unknown" for row in rows})
     result = {}
-    for surface in surfaces:
+    for surface in sorted({row["surface"] or "unknown" for row in rows}):
         own = [row for row in rows if (row["surface"] or "unknown") == surface]
-        result[surface] = {"num_images": count_scored(own, subject, "tom")}
-        result[surface]["summary"] = summarize(own, subject, aggregation)
+        result[surface] = {"num_images": count_scored(own, subject, "tom"), "summary": summarize(own, subject)}
         for model in ("base", "consensus"):
-            result[surface][model] = summarize(own, model, aggregation) if model in models else None
+            result[surface][model] = summarize(own, model) if model in models else None
+    return result
+
+
+def _per_scene(groups: list[dict], rows: list[dict], models: list[str], subject: str) -> dict:
+    result = {}
+    for scene in (group["group_id"] for group in groups):
+        own = [row for row in rows if row["group_id"] == scene]
+        result[scene] = {
+            "num_images": len(own),
+            "num_scored": count_scored(own, subject, "all"),
+            "summary": summarize(own, subject),
+            "base": summarize(own, "base") if "base" in models else None,
+        }
     return result

@@ -20,14 +20,12 @@ class GroupBootstrap:
 
     Args:
         rows (`list[dict]`): the rows of a report, one per image, with `group_id` and the metrics of its models.
-        aggregation (`str`): how the report averages: `image`, `pixel` or `group`.
         seed (`int`): of the draws; the same rows give the same intervals.
     """
 
-    def __init__(self, rows: list[dict], aggregation: str = "image", seed: int = 0) -> None:
+    def __init__(self, rows: list[dict], seed: int = 0) -> None:
         # Sorted: neither the order of the rows nor that of the groups matters.
         self.rows = sorted(rows, key=lambda row: (row["group_id"], row["image"]))
-        self.aggregation = aggregation
         names = sorted({row["group_id"] for row in rows})
         self.index = {name: number for number, name in enumerate(names)}
         self.draws = _draws(len(names), seed)
@@ -45,23 +43,15 @@ class GroupBootstrap:
     def _means(self, model: str, region: str, metric: str) -> np.ndarray:
         """The mean of every draw: sums over counts, both additive over groups."""
         sums, counts = np.zeros((2, len(self.index)))
-        power = (
-            2 if self.aggregation == "pixel" and metric == "rmse" else 1
-        )  # a root does not average, its square does
         for row in self.rows:
             value = value_of(row, model, region, metric)
             if not math.isnan(value):
-                weight = row["pixels"][region] if self.aggregation == "pixel" else 1
-                sums[self.index[row["group_id"]]] += weight * value**power
-                counts[self.index[row["group_id"]]] += weight
-        filled = counts > 0
-        if np.count_nonzero(filled) < 2:
+                sums[self.index[row["group_id"]]] += value
+                counts[self.index[row["group_id"]]] += 1
+        if np.count_nonzero(counts) < 2:
             return np.full(RESAMPLES, math.nan)
-        if self.aggregation == "group":
-            sums[filled] /= counts[filled]
-            counts = filled.astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return ((self.draws @ sums) / (self.draws @ counts)) ** (1 / power)
+            return (self.draws @ sums) / (self.draws @ counts)
 
 
 def mean_interval(values: list[float], seed: int = 0) -> Interval:

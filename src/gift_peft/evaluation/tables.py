@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.results import COLLAPSE_RANGE, REGIONS, BoosterReport, GiftIReport, mean
+from gift_peft.evaluation.results import COLLAPSE_RANGE, REGIONS, Report, mean
 from gift_peft.evaluation.statistics import GroupBootstrap, mean_interval, median_of, value_of
 from gift_peft.evaluation.table_formats import (
     Cell,
@@ -22,8 +22,6 @@ from gift_peft.evaluation.table_formats import (
     to_text,
     value_cell,
 )
-
-AnyReport = GiftIReport | BoosterReport
 
 REGION_NAMES = {"tom": "ToM", "other": "Other", "all": "All"}
 METRIC_NAMES = {"mae": "MAE ↓", "abs_rel": "AbsRel ↓", "rmse": "RMSE ↓", "delta1": "δ1 % ↑"}
@@ -48,7 +46,7 @@ def improved(metric: str, change: float) -> bool:
     return change > 0 if metric in HIGHER_IS_BETTER else change < 0
 
 
-def consensus_teaches(report: GiftIReport) -> bool | None:
+def consensus_teaches(report: Report) -> bool | None:
     """Whether the consensus beats the base inside the target, by RMSE; None where that is not known.
 
     It is not where no group has two observations of a target pixel: the median of one is that one.
@@ -64,9 +62,9 @@ def consensus_teaches(report: GiftIReport) -> bool | None:
 # ---- one report: `gift-peft evaluate` ----
 
 
-def report_tables(report: AnyReport) -> list[Table]:
+def report_tables(report: Report) -> list[Table]:
     """Metrics per region, and what has one number per model (GCE; RMSE per surface kind), with the notes."""
-    rows = []
+    rows: list[list[str | Cell] | None] = []
     for region in REGIONS:
         lines = _block(report, region)
         rows += [[REGION_NAMES[region] if i == 0 else "", label, *cells] for i, (label, cells) in enumerate(lines)]
@@ -76,17 +74,17 @@ def report_tables(report: AnyReport) -> list[Table]:
     return [metrics, pairs]
 
 
-def text_table(report: AnyReport, color: bool = False) -> str:
+def text_table(report: Report, color: bool = False) -> str:
     """The report as aligned plain text of at most 80 columns; improvements carry a `*` (and green if `color`)."""
     return "\n".join(to_text(table, color) for table in report_tables(report))
 
 
-def markdown_table(report: AnyReport) -> str:
+def markdown_table(report: Report) -> str:
     """The report as Markdown; improvements are bold."""
     return "\n".join(to_markdown(table) for table in report_tables(report))
 
 
-def notes(report: AnyReport) -> list[str]:
+def notes(report: Report) -> list[str]:
     """What stands under every table of a report: collapse check, consensus, protocol, skipped images."""
     lines = []
     if report.collapse:
@@ -96,36 +94,34 @@ def notes(report: AnyReport) -> list[str]:
             f"Adapted/base: target mean x{ratios[0]}, spread x{ratios[1]}: {state} "
             f"(outside {COLLAPSE_RANGE[0]:g}..{COLLAPSE_RANGE[1]:g})."
         )
-    if isinstance(report, GiftIReport) and consensus_teaches(report) is False:
+    if consensus_teaches(report) is False:
         lines.append(NO_TEACHING)
     return [*lines, protocol_note(report), skipped_note(report)]
 
 
-def protocol_note(report: AnyReport) -> str:
-    """The protocol's line, for Booster with what else the numbers depend on."""
+def protocol_note(report: Report) -> str:
+    """The protocol's line, with what else the numbers depend on."""
+    about = report.about
     parts = [f"Protocol {report.protocol['description']}"]
-    if isinstance(report, BoosterReport):
-        about = report.about
-        classes = about.get("tom_classes")
-        parts += [f"occlusion {about['occlusion']}"] if "occlusion" in about else []
-        parts += [f"ToM is classes {', '.join(map(str, classes))}"] if classes else []
-        parts += ["not the complete official set"] if about.get("official") is False else []
+    parts += [f"occlusion {about['occlusion']}"] if "occlusion" in about else []
+    parts += [f"ToM is classes {', '.join(map(str, about['tom_classes']))}"] if about.get("tom_classes") else []
+    parts += ["not the complete official set"] if about.get("official") is False else []
     return ", ".join(parts) + "."
 
 
-def skipped_note(report: AnyReport) -> str:
+def skipped_note(report: Report) -> str:
     """How many images are not in the means, and why."""
-    counts, gce = report.counts, _gce(report)
+    counts, gce = report.counts, report.gce
     reasons = ", ".join(f"{n} {reason}" for reason, n in counts["reasons"].items())
     other = f", {counts['without_other']} with nothing else" if counts["without_other"] else ""
     return (
         f"Skipped: {counts['skipped']} of {_count(counts['images'], 'image')}{f' ({reasons})' if reasons else ''}; "
-        f"{counts['without_tom']} without known target pixels{other}; {_gce_name(report)} over "
-        f"{_count(gce['num_groups'], _group_noun(report))}, {gce['num_skipped']} without a pair."
+        f"{counts['without_tom']} without known target pixels{other}; {report.gce_name} over "
+        f"{_count(gce['num_groups'], report.group_noun)}, {gce['num_skipped']} without a pair."
     )
 
 
-def _block(report: AnyReport, region: str) -> list[tuple[str, list[Cell]]]:
+def _block(report: Report, region: str) -> list[tuple[str, list[Cell]]]:
     """The lines of one region."""
 
     def line(label: str, summary: dict) -> tuple[str, list[Cell]]:
@@ -136,8 +132,8 @@ def _block(report: AnyReport, region: str) -> list[tuple[str, list[Cell]]]:
         lines.append(line("adapted", report.summary))
     if report.base and report.adapted:
         lines.append(("change", [_change(report.base, report.summary, region, metric) for metric in METRICS]))
-    if region == "tom" and (consensus := getattr(report, "consensus", None)):
-        lines.append(line("consensus", consensus))
+    if region == "tom" and report.consensus:
+        lines.append(line("consensus", report.consensus))
     return lines
 
 
@@ -146,16 +142,16 @@ def _change(base: dict, adapted: dict, region: str, metric: str) -> Cell:
     return change_cell(change, improved(metric, change))
 
 
-def _pair(label: str, base: float | None, adapted: float | None, consensus: float | None = None) -> list:
+def _pair(label: str, base: float | None, adapted: float | None, consensus: float | None = None) -> list[str | Cell]:
     return [label, *_compared([base, adapted]), value_cell(consensus)]
 
 
-def _pairs(report: AnyReport) -> list[list]:
+def _pairs(report: Report) -> list[list[str | Cell] | None]:
     """Lines of what has one number per model."""
-    gce, name = _gce(report), _gce_name(report)
-    pairs = [_pair(f"{name} ↓", gce["base"], gce["adapted"])]
+    gce, name = report.gce, report.gce_name
+    pairs: list[list[str | Cell] | None] = [_pair(f"{name} ↓", gce["base"], gce["adapted"])]
     pairs.append(_pair(f"{name} normalised ↓", gce["base_normalized"], gce["adapted_normalized"]))
-    for surface, entry in getattr(report, "by_surface", {}).items():
+    for surface, entry in report.by_surface.items():
         models = (entry["base"], entry["summary"] if report.adapted else None, entry["consensus"])
         values = [model and model["tom"]["rmse"] for model in models]
         pairs.append(_pair(f"ToM RMSE, {surface} ({entry['num_images']}) ↓", *values))
@@ -165,7 +161,7 @@ def _pairs(report: AnyReport) -> list[list]:
 # ---- several reports: the paper's Tables 1 and 2 ----
 
 
-def comparison_table(reports: Sequence[tuple[str, AnyReport]], regions: Sequence[str] = ("tom", "all")) -> Table:
+def comparison_table(reports: Sequence[tuple[str, Report]], regions: Sequence[str] = ("tom", "all")) -> Table:
     """Bases and other unadapted models, then every adapted one with its relative change; paper, Tables 1 and 2.
 
     Args:
@@ -202,11 +198,11 @@ def comparison_table(reports: Sequence[tuple[str, AnyReport]], regions: Sequence
     )
 
 
-def uncertainty_table(report: AnyReport) -> Table:
+def uncertainty_table(report: Report) -> Table:
     """Means with 95 % intervals, and medians, of every region and metric; then GCE, a mean over groups."""
     models = _models(report)
     summaries = {"base": report.base, "adapted": report.summary}
-    bootstrap = GroupBootstrap(report.rows, report.protocol["aggregation"])
+    bootstrap = GroupBootstrap(report.rows)
     rows: list[list[str | Cell] | None] = []
     for region in REGIONS:
         for metric in METRICS:
@@ -214,7 +210,7 @@ def uncertainty_table(report: AnyReport) -> Table:
                 estimate_cell(value_cell(summaries[model][region][metric]), bootstrap.interval(model, region, metric))
                 for model in models
             ]
-            if len(models) == 2:
+            if report.base and len(models) == 2:
                 change = _change(report.base, report.summary, region, metric)
                 cells.append(estimate_cell(change, bootstrap.change_interval(region, metric)))
             cells += [value_cell(median_of(report.rows, model, region, metric)) for model in models]
@@ -222,13 +218,12 @@ def uncertainty_table(report: AnyReport) -> Table:
         rows.append(None)
     rows.append(_gce_line(report, models))
     change = ["base to adapted"] if len(models) == 2 else []
-    mean_of = f"{report.protocol['aggregation']} mean"
-    spans = [(mean_of, len(models)), *(("change", 1) for _ in change), ("image median", len(models))]
+    spans = [("image mean", len(models)), *(("change", 1) for _ in change), ("image median", len(models))]
     title = f"{_title(report)}: intervals and medians"
     return Table(title, ["metric"], [*models, *change, *models], rows, spans, [INTERVALS, *notes(report)])
 
 
-def group_table(report: AnyReport) -> Table:
+def group_table(report: Report) -> Table:
     """One line per group: images, RMSE inside and outside the target before and after, GCE before and after."""
     models = _models(report)
     gce = {group["group_id"]: group for group in report.groups}
@@ -243,12 +238,12 @@ def group_table(report: AnyReport) -> Table:
         line += _compared([entry[f"gce_{model}"] if entry["counted"] else None for model in models])
         rows.append(line)
     columns = [*models, *(["change"] if len(models) == 2 else [])]
-    spans = [(title, len(columns)) for title in ("ToM RMSE ↓", "Other RMSE ↓", f"{_gce_name(report)} ↓")]
-    noun = _group_noun(report)
+    spans = [(title, len(columns)) for title in ("ToM RMSE ↓", "Other RMSE ↓", f"{report.gce_name} ↓")]
+    noun = report.group_noun
     return Table(f"{_title(report)}, per {noun}", [noun, "surface", "images"], columns * 3, rows, spans, notes(report))
 
 
-def _compared(values: list[float | None]) -> list[Cell]:
+def _compared(values: Sequence[float | None]) -> list[Cell]:
     """The models' values of an error, and where there are two its change."""
     cells = [value_cell(value) for value in values]
     if len(values) == 2:
@@ -257,17 +252,17 @@ def _compared(values: list[float | None]) -> list[Cell]:
     return cells
 
 
-def _gce_line(report: AnyReport, models: list[str]) -> list[str | Cell]:
+def _gce_line(report: Report, models: list[str]) -> list[str | Cell]:
     counted = [group for group in report.groups if group["counted"]]
     values = {model: [group[f"gce_{model}"] for group in counted] for model in models}
-    cells = _compared([_gce(report)[model] for model in models])
+    cells = _compared([report.gce[model] for model in models])
     for index, model in enumerate(models):
         cells[index] = estimate_cell(cells[index], mean_interval(values[model]))
     medians = [value_cell(float(np.median(values[model])) if counted else None) for model in models]
-    return [f"{_gce_name(report)} ↓", *cells, *medians]
+    return [f"{report.gce_name} ↓", *cells, *medians]
 
 
-def _models(report: AnyReport) -> list[str]:
+def _models(report: Report) -> list[str]:
     """Those of base and adapted that the evaluation ran."""
     return [model for model in ("base", "adapted") if report.rows and model in report.rows[0]]
 
@@ -275,29 +270,17 @@ def _models(report: AnyReport) -> list[str]:
 # ---- words ----
 
 
-def _title(report: AnyReport, with_counts: bool = True) -> str:
-    if isinstance(report, BoosterReport):
+def _title(report: Report, with_counts: bool = True) -> str:
+    if report.dataset == "booster":
         name = f"Booster {report.about.get('subset') or ''}".strip()
     else:
         against = "the treated-reference proxy" if report.reference == "proxy" else "true depth"
         split = report.about.get("split")
         name = f"GIFT-I{f' {split}' if split else ''} against {against}"
     counts = report.counts
-    size = f": {_count(counts['groups'], _group_noun(report))}, {_count(counts['images'], 'image')}"
+    size = f": {_count(counts['groups'], report.group_noun)}, {_count(counts['images'], 'image')}"
     return f"{name}{size if with_counts else ''} ({report.unit})"
 
 
 def _count(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-def _group_noun(report: AnyReport) -> str:
-    return "scene" if isinstance(report, BoosterReport) else "group"
-
-
-def _gce(report: AnyReport) -> dict:
-    return report.illumination_gce if isinstance(report, BoosterReport) else report.gce
-
-
-def _gce_name(report: AnyReport) -> str:
-    return "illumination GCE" if isinstance(report, BoosterReport) else "GCE"

@@ -9,69 +9,18 @@ from gift_peft.files import write_whole
 from gift_peft.options import OptionParser, add_adapter, add_base, add_dataset, use_color
 
 if TYPE_CHECKING:
-    from gift_peft.evaluation.results import BoosterReport, GiftIReport
+    from gift_peft.evaluation.results import Report
 
 
 def run_evaluation(
-    base: str | Path,
-    dataset: str | Path,
+    base: str | Path | None,
+    dataset: str | Path | None = None,
     adapter: str | Path | None = None,
     *,
-    reference: str = "proxy",
-    protocol: str | None = None,
-    split: str = "validation",
-    out: str | Path = "evaluation",
-    adapter_scale: float | None = None,
-    size: str | tuple[int, int] | None = None,
-    kind: str | None = None,
-    revision: str | None = None,
-    dataset_revision: str | None = None,
-    prediction_scale: float | None = None,
-    batch_size: int = 2,
-    device: str | None = None,
-    color: bool = False,
-    progress: bool = True,
-) -> "GiftIReport":
-    """`gift-peft evaluate`: loads, evaluates, prints the table, writes `metrics.json`, `rows.jsonl`, `report.md`."""
-    from gift_peft.dataset.gift_i import load_gift_i
-    from gift_peft.evaluation.on_gift_i import evaluate_gift_i
-    from gift_peft.models.loading import load_model
-
-    loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
-    groups = load_gift_i(dataset, split, dataset_revision=dataset_revision)
-    report = evaluate_gift_i(
-        groups,
-        loaded.model,
-        protocol=protocol,
-        reference=reference,
-        processor=loaded.processor,
-        size=loaded.size,
-        kind=kind or loaded.kind,
-        prediction_scale=prediction_scale,
-        batch_size=batch_size,
-        progress=progress,
-    )
-    report.about = {
-        "base": str(base),
-        "revision": revision,
-        "adapter": adapter and str(adapter),
-        "adapter_scale": adapter_scale,
-        "dataset": str(dataset),
-        "dataset_revision": dataset_revision,
-        "split": split,
-        "size": list(loaded.size),
-        "kind": kind or loaded.kind,
-    }
-    write_report(report, out, color)
-    return report
-
-
-def run_booster(
-    root: str | Path,
-    base: str | Path | None = None,
-    adapter: str | Path | None = None,
-    *,
+    booster: str | Path | None = None,
     predictions: str | Path | None = None,
+    split: str = "validation",
+    dataset_revision: str | None = None,
     out: str | Path = "evaluation",
     adapter_scale: float | None = None,
     size: str | tuple[int, int] | None = None,
@@ -80,43 +29,53 @@ def run_booster(
     device: str | None = None,
     color: bool = False,
     **options: Any,
-) -> "BoosterReport":
-    """`gift-peft evaluate --booster`: as `run_evaluation`, of a base or of stored predictions.
+) -> "Report":
+    """`gift-peft evaluate`: loads, evaluates, prints the table, writes `metrics.json`, `rows.jsonl`, `report.md`.
 
-    `options` are those of `evaluate_booster`.
+    Args:
+        base, adapter, adapter_scale, revision, size, kind, device: as in `DepthModel.from_pretrained`; `base` is None
+            where stored `predictions` stand in for it.
+        dataset, split, dataset_revision: of GIFT-I, as in `load_gift_i`; or `booster`, the root of Booster.
+        out: folder of the files.
+        color: of the table printed.
+        options: further arguments of `evaluate_gift_i`, or of `evaluate_booster`.
     """
+    from gift_peft.dataset.gift_i import load_gift_i
     from gift_peft.evaluation.booster_scenes import find_booster
-    from gift_peft.evaluation.on_booster import evaluate_booster
-    from gift_peft.models.loading import load_model
+    from gift_peft.evaluation.evaluate import evaluate_booster, evaluate_gift_i
+    from gift_peft.evaluation.tables import markdown_table, text_table
+    from gift_peft.models.loading import DepthModel
 
-    if predictions is not None:
-        report = evaluate_booster(root, predictions=predictions, kind=kind, **options)
-    else:
-        # What is wrong with these is said before large weights are loaded.
+    if booster:  # fail early: large weights take minutes to load
         get_protocol(options.get("protocol", "gift"))
-        find_booster(root, options.get("subset"), options.get("official"))
-        loaded = load_model(base, adapter, adapter_scale, revision, size=size, device=device)
-        options |= {"processor": loaded.processor, "size": loaded.size, "kind": kind or loaded.kind}
-        report = evaluate_booster(root, loaded.model, **options)
+        find_booster(booster, options.get("subset"), options.get("official"))
+    model = (
+        None
+        if base is None
+        else DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
+    )
+    if booster:
+        report = evaluate_booster(booster, model, predictions, kind if model is None else None, **options)
+    elif dataset is None:
+        raise ValueError("an evaluation needs a dataset, or the root of Booster")
+    else:
+        groups = load_gift_i(dataset, split, dataset_revision=dataset_revision)
+        report = evaluate_gift_i(groups, model, **options)
+        report.about = {"dataset": str(dataset), "dataset_revision": dataset_revision, "split": split}
+    if model is not None:
         report.about |= {
             "base": str(base),
             "revision": revision,
             "adapter": adapter and str(adapter),
             "adapter_scale": adapter_scale,
-            "size": list(loaded.size),
+            "size": list(model.size),
+            "kind": model.kind,
         }
-    write_report(report, out, color)
-    return report
-
-
-def write_report(report: "GiftIReport | BoosterReport", out: str | Path, color: bool = False) -> None:
-    """Leaves the report in a folder and prints its table."""
-    from gift_peft.evaluation.tables import markdown_table, text_table
-
     folder = report.save(out)
     write_whole(folder / "report.md", markdown_table(report))
     print(text_table(report, color=color))
     print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
+    return report
 
 
 def make_parser() -> OptionParser:
@@ -159,37 +118,25 @@ def run(argv: Sequence[str]) -> int:
         parser.error("one of --base and --predictions is required")
     if args.predictions and (args.dataset or args.adapter):
         parser.error("--predictions go with --booster, and without --adapter")
-    common = {
-        "out": args.out,
-        "adapter_scale": args.adapter_scale,
-        "size": args.size,
-        "kind": args.kind,
-        "revision": args.revision,
-        "prediction_scale": args.prediction_scale,
-        "color": use_color(),
-    }
+    options: dict[str, Any] = {"prediction_scale": args.prediction_scale, "color": use_color()}
     if args.booster:
-        run_booster(
-            args.booster,
-            args.base,
-            args.adapter,
-            predictions=args.predictions,
-            protocol=args.protocol or "gift",
-            resize=args.resize,
-            occlusion=args.occlusion,
-            subset=args.subset,
-            official=False if args.partial else None,
-            **common,
-        )
+        options |= {"resize": args.resize, "occlusion": args.occlusion, "subset": args.subset}
+        options |= {"protocol": args.protocol or "gift", "official": False if args.partial else None}
     else:
-        run_evaluation(
-            args.base,
-            args.dataset,
-            args.adapter,
-            reference=args.reference,
-            protocol=args.protocol,
-            split=args.split,
-            dataset_revision=args.dataset_revision,
-            **common,
-        )
+        options |= {"reference": args.reference, "protocol": args.protocol}
+    run_evaluation(
+        args.base,
+        args.dataset,
+        args.adapter,
+        booster=args.booster,
+        predictions=args.predictions,
+        split=args.split,
+        dataset_revision=args.dataset_revision,
+        out=args.out,
+        adapter_scale=args.adapter_scale,
+        size=args.size,
+        kind=args.kind,
+        revision=args.revision,
+        **options,
+    )
     return 0

@@ -1,33 +1,278 @@
-"""Loading a base with its adapter, ready to predict."""
+"""`DepthModel`: a base with its adapter, ready to predict; everything that predicts takes one.
 
+    model = DepthModel.from_pretrained(base, adapter)
+    depth = model.depth_at("photo.jpg")
+
+It is asked once: the image processor, the size at the network, what is predicted and in which unit are its own.
+"""
+
+import inspect
 import pickle
 import re
 import warnings
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
-from pickle import UnpicklingError
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image
 
+from gift_peft.files import reason
+from gift_peft.images import read_image
 from gift_peft.models.identity import check_base_name, teacher_revision
-from gift_peft.models.pixels import resolve_size
+from gift_peft.models.pixels import resolve_size, to_pixel_values
+from gift_peft.rules import KINDS
+
+METRIC_MODELS = {"zoedepth", "depth_pro", "prompt_depth_anything"}  # they predict metres without saying so
 
 
-class LoadedModel(NamedTuple):
-    """A model ready to predict: eval mode, float32, on its device.
+class DepthModel:
+    """A base with its adapter, or any network that predicts depth, with what predicting needs.
+
+    Predictions are made in eval mode, in float32, without gradients and without autocast, on the network's device;
+    modes and gradients of a network that is being trained are left as they were.
 
     Args:
-        model (`transformers.PreTrainedModel` or `peft.PeftModel`): the base, or the base under its adapter.
-        processor: the image processor, the adapter's where it brings one.
+        network: a `PeftModel`, whose base is reached by `disable_adapter()`; a depth model of transformers; any module
+            or function of pixel values (B,3,h,w) that gives (B,H,W) or an output with `.predicted_depth`.
+        processor (*optional*): the image processor; default that of the place the network came from.
+        size (*optional*): (height, width) at the network, or "HxW"; default the recipe's, else the processor's.
+        kind (`str`, *optional*): what is predicted, `depth` or `inverse_depth`; default what config or recipe say.
+        teacher (*optional*): the base of a network that is no `PeftModel`: a network, a folder or a hub id.
+
+    Attributes:
+        network: as given.
+        processor: a copy that resizes every picture to exactly `size`.
         size (`tuple[int, int]`): (height, width) at the network.
-        kind (`str`, *optional*): `depth` or `inverse_depth`; None for an architecture without a recipe, unless the
-            adapter says it.
+        kind (`str`, *optional*): None where nothing says it.
+        millimeters_per_unit (`float`): 1000 for models that say they predict metres, else 1.
+        adapted (`bool`): whether there is a base to compare with, so that `predict` is not `predict_base`.
     """
 
-    model: Any
-    processor: Any
-    size: tuple[int, int]
-    kind: str | None
+    def __init__(
+        self,
+        network: Any,
+        processor: Any = None,
+        size: str | tuple[int, int] | None = None,
+        kind: str | None = None,
+        teacher: Any = None,
+    ) -> None:
+        if kind not in (None, *KINDS):
+            raise ValueError(f"unknown kind {kind!r}: choose one of {', '.join(KINDS)}")
+        config = getattr(network, "config", None)
+        self.network, self._processor, self._size = network, processor, size
+        self.kind = kind or _stated_kind(network)
+        metric = getattr(config, "depth_estimation_type", None) == "metric"
+        metric = metric or getattr(config, "model_type", None) in METRIC_MODELS
+        self.millimeters_per_unit = 1000.0 if metric else 1.0
+        has_adapter = hasattr(network, "disable_adapter")
+        if isinstance(teacher, str | Path) and not has_adapter:
+            teacher = type(self).from_pretrained(teacher)
+        teacher = teacher.network if isinstance(teacher, DepthModel) else teacher
+        self._teacher = None if has_adapter else teacher
+        self.adapted = has_adapter or teacher is not None
+
+    @classmethod
+    def of(cls, model: Any, **options: Any) -> "DepthModel":
+        """What the evaluations accept, as one object: a `DepthModel` itself, or a network with the options above."""
+        if not isinstance(model, cls):
+            return cls(model, **options)
+        given = [name for name, value in options.items() if value is not None]
+        if given:
+            raise ValueError(f"a DepthModel brings its own {' and '.join(given)}: give it where the model is made")
+        return model
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        base: str | Path,
+        adapter: str | Path | None = None,
+        adapter_scale: float | None = None,
+        revision: str | None = None,
+        size: str | tuple[int, int] | None = None,
+        kind: str | None = None,
+        device: str | torch.device | None = None,
+    ) -> "DepthModel":
+        """A base model, with an adapter if one is named.
+
+        Args:
+            base: folder or hub id; or `da3:<id>`, `moge:<id>` for a model of those packages, which takes no adapter.
+            adapter (*optional*): folder or hub id in PEFT format.
+            adapter_scale (`float`, *optional*): 0 is the base, 1 the adapter, to the bit.
+            revision (`str`, *optional*): of the base.
+            size (*optional*): (height, width) or "HxW"; default the adapter's training size, else the recipe's, else
+                the image processor's.
+            kind (`str`, *optional*): `depth` or `inverse_depth`; default the recipe's, else the adapter's.
+            device (*optional*): default CUDA where there is one.
+
+        Raises:
+            FileNotFoundError: no model or adapter at that place.
+            ValueError: the adapter was made for another base, or no size is known.
+        """
+        from gift_peft.adapters.folder import read_gift
+        from gift_peft.adapters.scale import set_adapter_scale
+        from gift_peft.models.external import load_external, split_external
+
+        if adapter is None and adapter_scale is not None:
+            raise ValueError("adapter_scale needs an adapter")
+        if split_external(base):
+            if adapter is not None:
+                raise ValueError(f"base {base}: an adapter needs a model of transformers")
+            network, processor = load_external(base)
+        else:
+            network, processor = load_base(base, revision)
+        if adapter is not None:
+            network, processor = _attach(network, processor, base, adapter, revision)
+            kind = kind or _stated_kind(network) or read_gift(adapter).get("kind")
+            if adapter_scale is not None:
+                set_adapter_scale(network, adapter_scale)
+            stated = getattr(processor, "size", None) or {}
+            if size is None and "height" in stated and "width" in stated:
+                size = stated["height"], stated["width"]
+        size = resolve_size(size, _recipe(network), processor, network.config)
+        network.to(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        return cls(network.eval(), processor, size, kind)
+
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """(height, width) at the network; ValueError if nothing fixes it."""
+        config = getattr(self.network, "config", None)
+        return resolve_size(self._size, _recipe(self.network), self._given_processor, config)
+
+    @cached_property
+    def processor(self) -> Any:
+        """The image processor at that size; ValueError if the network does not say where it came from."""
+        from gift_peft.adapters.folder import processor_at_size
+
+        return processor_at_size(self._given_processor, self.size)
+
+    @cached_property
+    def _given_processor(self) -> Any:
+        if self._processor is not None:
+            return self._processor
+        source = getattr(getattr(self.network, "config", None), "_name_or_path", "")
+        if not source:
+            raise ValueError("the model does not say where it came from; pass its processor=")
+        return load_processor(source)
+
+    def known_kind(self) -> str:
+        """`kind`; ValueError where nothing says it."""
+        if self.kind is None:
+            config = getattr(self.network, "config", None)
+            name = getattr(config, "model_type", type(self.network).__name__)
+            known = "say what the model predicts" if config is None else f"no recipe says what {name} predicts"
+            raise ValueError(f'{known}: kind="depth" or kind="inverse_depth"')
+        return self.kind
+
+    def inputs(self, images: Sequence[Image.Image]) -> torch.Tensor:
+        """N RGB pictures of any size to pixel values (N,3,h,w) float32, as in training."""
+        return to_pixel_values(images, self.processor, self.size)
+
+    def predict(self, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
+        """(N,3,h,w) to (N,h,w) float32 on the CPU, in native units: micro-batches in image order."""
+        return self._predict(pixel_values, batch_size, base=False)
+
+    def predict_base(self, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
+        """`predict` of the base alone: with the adapter off, or by the teacher."""
+        return self._predict(pixel_values, batch_size, base=True)
+
+    def depth_at(
+        self,
+        image: str | Path | Image.Image | np.ndarray,
+        focal_length: float | tuple[float, float] | None = None,
+        base: bool = False,
+    ) -> np.ndarray:
+        """Depth of a picture at its own size, as `gift-peft predict` writes it.
+
+        The image processor's own `post_process_depth_estimation` brings it there, as in transformers' pipeline.
+
+        Args:
+            image: a file, an RGB picture, or an array (H,W,3) uint8.
+            focal_length (*optional*): fx or (fx, fy) of the camera in pixels of the picture, where the processor takes
+                one (Metric3D, whose depth is then in metres of that camera).
+            base (`bool`): depth of the base alone.
+
+        Returns:
+            `np.ndarray`: (H,W) float32 in native units.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: no picture, NaN or infinity in the prediction, a focal length that the processor does not take.
+        """
+        name = str(image) if isinstance(image, str | Path) else "the picture"
+        if isinstance(image, np.ndarray):
+            if image.dtype != np.uint8:
+                raise ValueError(f"{name}: (H,W,3) uint8 is expected, not {image.dtype}")
+            image = Image.fromarray(image)
+        picture = read_image(image, name)
+        post_process, options = self.processor.post_process_depth_estimation, {}
+        if focal_length is not None:
+            if "focal_lengths" not in inspect.signature(post_process).parameters:
+                raise ValueError(f"focal_length: {type(self.processor).__name__} takes none")
+            options["focal_lengths"] = [focal_length]
+        output = self._forward(self.inputs([picture]), base)
+        if isinstance(output, torch.Tensor):
+            output = SimpleNamespace(predicted_depth=output)
+        if not torch.isfinite(output.predicted_depth).all():
+            raise ValueError(f"{name}: the prediction has NaN or infinite values")
+        (depth,) = post_process(output, target_sizes=[(picture.height, picture.width)], **options)
+        return depth["predicted_depth"].float().cpu().numpy()
+
+    def _predict(self, pixel_values: torch.Tensor, batch_size: int, base: bool) -> torch.Tensor:
+        outputs = (self._forward(batch, base) for batch in pixel_values.split(batch_size))
+        return torch.cat([getattr(output, "predicted_depth", output).float().cpu() for output in outputs])
+
+    def _forward(self, pixel_values: torch.Tensor, base: bool) -> Any:
+        if base and self._teacher is not None:
+            return _forward(self._teacher, pixel_values)
+        if not base or not self.adapted:
+            return _forward(self.network, pixel_values)
+        # PEFT turns on the gradients of every adapter weight when the adapter comes back, frozen ones included.
+        gradients = [(weight, weight.requires_grad) for weight in self.network.parameters()]
+        try:
+            with self.network.disable_adapter():
+                return _forward(self.network, pixel_values)
+        finally:
+            for weight, flag in gradients:
+                weight.requires_grad_(flag)
+
+
+def _forward(network: Any, pixel_values: torch.Tensor) -> Any:
+    """One forward as predictions are made. A module is called with `pixel_values=`, anything else as a function."""
+    is_module = isinstance(network, torch.nn.Module)
+    weight = next(network.parameters(), None) if is_module else None
+    device = torch.device("cpu") if weight is None else weight.device
+    training = [module for module in network.modules() if module.training] if is_module else []
+    if training:
+        network.eval()
+    try:
+        with torch.no_grad(), torch.autocast(device.type, enabled=False):
+            return network(pixel_values=pixel_values.to(device)) if is_module else network(pixel_values)
+    finally:
+        for module in training:
+            module.training = True
+
+
+def _recipe(network: Any) -> Any:
+    from gift_peft.adapters.recipes import get_recipe
+
+    try:
+        return get_recipe(network)
+    except ValueError:
+        return None  # an architecture without a recipe still predicts
+
+
+def _stated_kind(network: Any) -> str | None:
+    """What a model's config or recipe say it predicts."""
+    config, recipe = getattr(network, "config", None), _recipe(network)
+    # A model of another package says it itself.
+    return getattr(config, "prediction_kind", None) or (recipe and recipe.kind_for(config))
+
+
+# ---- from a folder or the hub ----
 
 
 def load_base(base: str | Path, revision: str | None = None) -> tuple[Any, Any]:
@@ -36,122 +281,34 @@ def load_base(base: str | Path, revision: str | None = None) -> tuple[Any, Any]:
     Raises FileNotFoundError where there is none, ValueError for weights that do not fit or are damaged.
     """
     from safetensors import SafetensorError
-    from transformers import AutoImageProcessor, AutoModelForDepthEstimation
+    from transformers import AutoModelForDepthEstimation
 
     check_base_name(base)
     options = {"revision": revision, "trust_remote_code": False}  # no question on the terminal, no foreign code
     try:
         model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, **options)
-        return model.eval(), AutoImageProcessor.from_pretrained(base, backend="pil", **options)
+        return model.eval(), load_processor(base, revision)
     except OSError as error:
-        raise FileNotFoundError(f"base model {base}: {_first_line(error)}") from error
+        raise FileNotFoundError(f"base model {base}: {reason(error)}") from error
     except pickle.UnpicklingError:
         raise ValueError(
             f"base model {base}: its weights are a pickle that would run code; take safetensors"
         ) from None
-    except (
-        ValueError,
-        RuntimeError,
-        SafetensorError,
-        UnpicklingError,
-    ) as error:  # of another shape, cut off, no tensors
-        raise ValueError(f"base model {base}: {_first_line(error)}") from error
+    except (ValueError, RuntimeError, SafetensorError) as error:  # of another shape, cut off, no tensors
+        raise ValueError(f"base model {base}: {reason(error)}") from error
 
 
-def load_model(
-    base: str | Path,
-    adapter: str | Path | None = None,
-    adapter_scale: float | None = None,
-    revision: str | None = None,
-    size: str | tuple[int, int] | None = None,
-    device: str | torch.device | None = None,
-) -> LoadedModel:
-    """A base model, with an adapter if one is named.
+def load_processor(source: str | Path, revision: str | None = None) -> Any:
+    """The image processor of a folder or hub id; Pillow resizes, as in training, and no foreign code runs."""
+    from transformers import AutoImageProcessor
 
-    Args:
-        base: folder or hub id; or `da3:<id>`, `moge:<id>` for a model of those packages, which takes no adapter.
-        adapter (*optional*): folder or hub id in PEFT format.
-        adapter_scale (`float`, *optional*): 0 is the base, 1 the adapter, to the bit.
-        revision (`str`, *optional*): of the base.
-        size (*optional*): (height, width) or "HxW"; default the adapter's training size, else the recipe's, else the
-            image processor's.
-        device (*optional*): default CUDA where there is one.
-
-    Raises:
-        FileNotFoundError: no model or adapter at that place.
-        ValueError: the adapter was made for another base, or no size is known.
-    """
-    from gift_peft.adapters.folder import read_gift
-    from gift_peft.adapters.recipes import get_recipe
-    from gift_peft.adapters.scale import set_adapter_scale
-    from gift_peft.models.external import load_external, split_external
-
-    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-    if split_external(base):
-        if adapter is not None or adapter_scale is not None:
-            raise ValueError(f"base {base}: an adapter needs a model of transformers")
-        model, processor = load_external(base)
-        size = resolve_size(size, None, processor, model.config)
-        return LoadedModel(model.to(device).eval(), processor, size, model.config.prediction_kind)
-    model, processor = load_base(base, revision)
-    config = model.config
-    try:
-        recipe = get_recipe(model)
-    except ValueError:
-        recipe = None  # an architecture without a recipe still predicts; its kind has to be told where it matters
-    kind = recipe and recipe.kind_for(config)
-    if adapter is not None:
-        model, processor = _attach(model, processor, base, adapter, revision)
-        kind = kind or read_gift(adapter).get("kind")
-        if adapter_scale is not None:
-            set_adapter_scale(model, adapter_scale)
-        stated = getattr(processor, "size", None) or {}
-        if size is None and "height" in stated and "width" in stated:
-            size = stated["height"], stated["width"]
-    elif adapter_scale is not None:
-        raise ValueError("adapter_scale needs an adapter")
-    size = resolve_size(size, recipe, processor, config)
-    return LoadedModel(model.to(device).eval(), processor, size, kind)
-
-
-def predict_depth(model: Any, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
-    """(N,3,h,w) images to (N,h,w) float32 on the CPU: micro-batches in image order, no gradients, no autocast.
-
-    `model` is called with `pixel_values=` if it is a module (`.predicted_depth` or a tensor comes back), else as a
-    plain function of the tensor.
-    """
-    is_module = isinstance(model, torch.nn.Module)
-    weight = next(model.parameters(), None) if is_module else None
-    device = torch.device("cpu") if weight is None else weight.device
-    depths = []
-    with torch.no_grad(), torch.autocast(device.type, enabled=False):
-        for batch in pixel_values.split(batch_size):
-            output = model(pixel_values=batch.to(device)) if is_module else model(batch)
-            depths.append(getattr(output, "predicted_depth", output).float().cpu())
-    return torch.cat(depths)
-
-
-def prediction_kind(model: Any) -> str:
-    """`depth` or `inverse_depth`, as the model's recipe says; ValueError where there is none to ask."""
-    from gift_peft.adapters.recipes import get_recipe
-
-    config = getattr(model, "config", None)
-    if config is None:
-        raise ValueError('say what the model predicts: kind="depth" or kind="inverse_depth"')
-    if getattr(config, "prediction_kind", None):  # a model of another package says it itself
-        return config.prediction_kind
-    try:
-        return get_recipe(model).kind_for(config)
-    except ValueError:
-        name = getattr(config, "model_type", type(model).__name__)
-        raise ValueError(f'no recipe says what {name} predicts: kind="depth" or kind="inverse_depth"') from None
+    return AutoImageProcessor.from_pretrained(source, revision=revision, backend="pil", trust_remote_code=False)
 
 
 def _attach(model, processor, base, adapter, revision):
     """The PeftModel and its image processor; one clear error if the adapter belongs to another base."""
     from peft import PeftModel
     from safetensors import SafetensorError
-    from transformers import AutoImageProcessor
 
     from gift_peft.adapters.folder import ADAPTER_WEIGHTS, PROCESSOR_CONFIG, read_adapter_config
 
@@ -165,14 +322,14 @@ def _attach(model, processor, base, adapter, revision):
         try:
             model = PeftModel.from_pretrained(model, adapter)
         except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, UserWarning, re.error) as error:
-            raise ValueError(f"{mismatch} ({_first_line(error)})") from None
+            raise ValueError(f"{mismatch} ({reason(error)})") from None
         except (OSError, SafetensorError) as error:
-            raise ValueError(f"adapter {adapter}: damaged {ADAPTER_WEIGHTS} ({_first_line(error)})") from None
+            raise ValueError(f"adapter {adapter}: damaged {ADAPTER_WEIGHTS} ({reason(error)})") from None
     try:
-        processor = AutoImageProcessor.from_pretrained(adapter, backend="pil", trust_remote_code=False)
+        processor = load_processor(adapter)
     except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
         if (Path(adapter) / PROCESSOR_CONFIG).exists():
-            raise ValueError(f"adapter {adapter}: damaged {PROCESSOR_CONFIG} ({_first_line(error)})") from None
+            raise ValueError(f"adapter {adapter}: damaged {PROCESSOR_CONFIG} ({reason(error)})") from None
         # An adapter that PEFT alone saved: the base's processor serves.
     return model, processor
 
@@ -181,8 +338,7 @@ def _check_base(base, revision, adapter, made_for: str | None) -> None:
     """ValueError unless the adapter was trained on this base, as far as weights and names tell.
 
     Two folders are compared by the digest in gift.json (without it, of the folder named, if that is still there), two
-    hub ids by name. A folder here for a hub id there, or the
-    other way round, may be a copy: then shapes alone decide.
+    hub ids by name. A folder on one side and a hub id on the other may be copies of one model: then shapes decide.
     """
     from gift_peft.adapters.folder import read_gift
 
@@ -194,7 +350,3 @@ def _check_base(base, revision, adapter, made_for: str | None) -> None:
         raise ValueError(f"adapter {adapter} was trained on {made_for}, whose files are not those of base {base}")
     if made_for not in (None, str(base)) and not was_folder and not is_folder and not Path(made_for).exists():
         raise ValueError(f"adapter {adapter} was trained on {made_for}, not on base {base}")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from gift_peft.evaluation.protocols import PROTOCOLS
-from gift_peft.evaluation.results import BoosterReport, GiftIReport
 from gift_peft.evaluation.table_formats import Cell, Table, value_cell
 from gift_peft.evaluation.tables import protocol_note, skipped_note
 from gift_peft.reports.curves import DIVERGED
@@ -59,7 +58,7 @@ def _values(run: SavedRun) -> dict[str, float | None]:
     row = run.best_row() or {}
     values = {key: row.get(key) for key in COLUMNS}
     for report in run.evaluations.values():
-        if isinstance(report, BoosterReport) and report.adapted:
+        if report.dataset == "booster" and report.adapted:
             for region in ("tom", "other"):
                 if values[f"booster_{region}_rmse"] is None:
                     values[f"booster_{region}_rmse"] = report.summary[region]["rmse"]
@@ -77,7 +76,7 @@ def _collapsed(run: SavedRun, row: dict) -> bool:
 def _notes(runs: Sequence[SavedRun], collapsed: bool) -> list[str]:
     notes = [f"GIFT-I: the validation of training, in proxy units. Protocol {PROTOCOLS['native'].describe()}."]
     reports = [report for run in runs for report in run.evaluations.values()]
-    proxies = [r for r in reports if isinstance(r, GiftIReport) and r.reference == "proxy"]
+    proxies = [r for r in reports if r.reference == "proxy"]
     notes += dict.fromkeys(map(skipped_note, proxies))
     if not proxies:
         notes.append("Skipped images are counted by `gift-peft evaluate`; these runs have no such evaluation.")
@@ -85,7 +84,7 @@ def _notes(runs: Sequence[SavedRun], collapsed: bool) -> list[str]:
         logged = replace(PROTOCOLS["gift"], resolution=0.25)
         notes.append(f"Booster: measured in training. Protocol {logged.describe()}.")
     else:
-        boosters = [report for report in reports if isinstance(report, BoosterReport)]
+        boosters = [report for report in reports if report.dataset == "booster"]
         notes += dict.fromkeys(f"Booster: {line}" for r in boosters for line in (protocol_note(r), skipped_note(r)))
     if collapsed:
         notes.append(f"{COLLAPSED} collapsed (alarm, or Other RMSE over {DIVERGED:g} times the base's): not compared.")

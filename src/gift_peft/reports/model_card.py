@@ -13,13 +13,12 @@ from typing import Any
 import yaml
 
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.results import REGIONS, BoosterReport
+from gift_peft.evaluation.results import REGIONS, Report
 from gift_peft.evaluation.table_formats import number, to_markdown
 from gift_peft.evaluation.tables import (
     METRIC_NAMES,
     NO_TEACHING,
     REGION_NAMES,
-    AnyReport,
     consensus_teaches,
     markdown_table,
     relative_change,
@@ -113,7 +112,7 @@ def find_backbone(name: str) -> Backbone | None:
 
 
 def model_card(
-    arguments: Mapping[str, Any], record: Mapping[str, Any] | None = None, reports: Sequence[AnyReport] = ()
+    arguments: Mapping[str, Any], record: Mapping[str, Any] | None = None, reports: Sequence[Report] = ()
 ) -> str:
     """README.md of an adapter; it names no path of this machine.
 
@@ -201,12 +200,12 @@ def _validation(record: Mapping | None) -> list[tuple[str, str, str, str]]:
     return [_row(label, base[key], adapted[key]) for label, key in rows if adapted.get(key) is not None]
 
 
-def _retention(record: Mapping | None, reports: Sequence[AnyReport]) -> list[tuple[str, str, str, str]]:
+def _retention(record: Mapping | None, reports: Sequence[Report]) -> list[tuple[str, str, str, str]]:
     """What the adapter costs outside the target."""
     lines = []
     for report in reports:
         if report.base and report.adapted:
-            where = "Booster" if isinstance(report, BoosterReport) else f"GIFT-I, {report.reference}"
+            where = "Booster" if report.dataset == "booster" else f"GIFT-I, {report.reference}"
             lines.append((where, report.base["other"], report.summary["other"]))
     if not lines and record is not None:
         base, adapted = ({m: record["metrics"][k].get(f"val_other_{m}") for m in METRICS} for k in ("base", "adapter"))
@@ -234,14 +233,14 @@ def _mebibytes(parameters: int) -> str:
     return f"{size:.0f} MiB" if size >= 100 else f"{size:.3g} MiB"
 
 
-def _limits(record: Mapping | None, reports: Sequence[AnyReport]) -> list[str]:
+def _limits(record: Mapping | None, reports: Sequence[Report]) -> list[str]:
     """What was measured and speaks against the adapter."""
     limits = []
     for report in reports:
-        where = "Booster" if isinstance(report, BoosterReport) else f"GIFT-I ({report.reference})"
+        where = "Booster" if report.dataset == "booster" else f"GIFT-I ({report.reference})"
         if report.collapse and report.collapse["alarm"]:
             limits.append(f"Collapse alarm on {where}: the outputs shrank, grew or flattened. Do not use it.")
-        if not isinstance(report, BoosterReport) and consensus_teaches(report) is False:
+        if consensus_teaches(report) is False:
             limits.append(f"{where}: {NO_TEACHING}")
         if report.base and report.adapted:
             for region in ("tom", "other"):
@@ -275,7 +274,7 @@ def base_license(base: str) -> str:
 
 
 def card_metadata(
-    arguments: Mapping, record: Mapping | None, reports: Sequence[AnyReport], backbone: Backbone | None
+    arguments: Mapping, record: Mapping | None, reports: Sequence[Report], backbone: Backbone | None
 ) -> Any:
     """`ModelCardData` of an adapter; arguments as in `model_card`, `backbone` if its base is one of the paper's."""
     from huggingface_hub import ModelCardData
@@ -297,13 +296,13 @@ def card_metadata(
     )
 
 
-def _eval_results(arguments: Mapping, record: Mapping | None, reports: Sequence[AnyReport]) -> list:
+def _eval_results(arguments: Mapping, record: Mapping | None, reports: Sequence[Report]) -> list:
     """One entry per metric of the adapter: of every report, else of the run's own validation."""
     entries = []
     dataset = arguments.get("dataset_name") or "gift-i"
     kind = dataset if is_hub_id(dataset) else "gift-i"
     for report in reports:
-        if isinstance(report, BoosterReport):
+        if report.dataset == "booster":
             config = f"{report.about.get('subset') or 'default'}, protocol {report.protocol['name']}"
             entries.append(("Booster", "booster", config, _flat(report.summary)))
             continue

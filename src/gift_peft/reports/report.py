@@ -14,13 +14,13 @@ from pathlib import Path
 from tqdm import tqdm
 
 from gift_peft.adapters.folder import ADAPTER_WEIGHTS
-from gift_peft.evaluation.results import BoosterReport
+from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
-from gift_peft.evaluation.tables import AnyReport, comparison_table, group_table, protocol_note, uncertainty_table
+from gift_peft.evaluation.tables import comparison_table, group_table, protocol_note, uncertainty_table
 from gift_peft.files import reason, write_whole
 from gift_peft.images import list_images
-from gift_peft.models.loading import load_model
+from gift_peft.models.loading import DepthModel
 from gift_peft.reports.ablation import ablation_table, is_ablation
 from gift_peft.reports.compare import write_compare
 from gift_peft.reports.curves import draw_dynamics, draw_retention
@@ -144,7 +144,7 @@ def _write_card(run: SavedRun, path: Path) -> Path:
     return path
 
 
-def _is_of_adapter(run: SavedRun, report: AnyReport) -> bool:
+def _is_of_adapter(run: SavedRun, report: Report) -> bool:
     """Whether an evaluation is of the run's adapter: of these weights, at scale 1."""
     if not report.adapted or report.about.get("adapter_scale") not in (None, 1):
         return False
@@ -180,7 +180,7 @@ def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> N
 
 def _tables(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> None:
     """One comparison per dataset and protocol, with intervals and groups of every report behind it."""
-    together: dict[tuple, list[tuple[str, str, AnyReport]]] = {}
+    together: dict[tuple, list[tuple[str, str, Report]]] = {}
     for run, name, own in zip(runs, names, folder_names(runs), strict=True):
         for report in run.evaluations.values():
             key = (_dataset(report), report.unit, protocol_note(report))
@@ -203,11 +203,11 @@ def _tables(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> N
         output.table("loss-weights", ablation_table(runs), show=True)
 
 
-def _dataset(report: AnyReport) -> str:
-    return "booster" if isinstance(report, BoosterReport) else f"gift-i-{report.reference}"
+def _dataset(report: Report) -> str:
+    return "booster" if report.dataset == "booster" else f"gift-i-{report.reference}"
 
 
-def _scaled(name: str, report: AnyReport) -> str:
+def _scaled(name: str, report: Report) -> str:
     scale = report.about.get("adapter_scale")
     return name if scale in (None, 1) else f"{name} (adapter scale {scale:g})"
 
@@ -265,7 +265,7 @@ def _pictures(run: SavedRun, name: str, output: Output, count: int, device: str 
         output.figure(f"errors{stem}", f"{title}: errors", partial(error_maps, rows))
 
 
-def notable_observations(report: AnyReport, count: int) -> dict[tuple[str, str], str]:
+def notable_observations(report: Report, count: int) -> dict[tuple[str, str], str]:
     """{(group, image): why} of at most `count` observations, each of another group, chosen by rule and not by hand.
 
     In turn: the largest RMSE of the base inside the target, the largest improvement, the largest deterioration.
@@ -294,29 +294,26 @@ def notable_observations(report: AnyReport, count: int) -> dict[tuple[str, str],
 
 
 def _panels(
-    run: SavedRun, report: AnyReport, notable: dict, kept: dict[tuple[str, str], Panel], device: str | None
+    run: SavedRun, report: Report, notable: dict, kept: dict[tuple[str, str], Panel], device: str | None
 ) -> Iterator[Panel]:
     """Panels group by group, so that one group is in memory at a time; the notable ones are also put into `kept`."""
     about = report.about
     base = about.get("base") or run.arguments.get("model_name_or_path")
-    loaded = load_model(
-        base, about["adapter"], about.get("adapter_scale"), about.get("revision"), about.get("size"), device
-    )
-    options = {"processor": loaded.processor, "size": loaded.size, "kind": about.get("kind") or loaded.kind}
-    options["protocol"] = report.protocol["name"]
+    choices = (about.get(name) for name in ("adapter_scale", "revision", "size", "kind"))
+    model = DepthModel.from_pretrained(base, about["adapter"], *choices, device)
     wanted = _wanted(report, notable)
     if not wanted:
         raise ValueError("no image has a known target to compare")
-    groups = None if isinstance(report, BoosterReport) else _group_rows(report)
+    groups = None if report.dataset == "booster" else _group_rows(report)
     for group_id, images in tqdm(wanted.items(), desc="pictures", unit="group", disable=None):
         labels = {image: _label(group_id, image, notable) for image in images}
-        for image, panel in zip(images, _group_panels(report, groups, group_id, labels, loaded, options), strict=True):
+        for image, panel in zip(images, _group_panels(report, groups, group_id, labels, model), strict=True):
             if (group_id, image) in notable:
                 kept[group_id, image] = panel
             yield panel
 
 
-def _wanted(report: AnyReport, notable: dict) -> dict[str, list[str]]:
+def _wanted(report: Report, notable: dict) -> dict[str, list[str]]:
     """{group: images}: the notable images, and of the groups with the largest errors the image with the largest."""
     worst: dict[str, tuple[float, str]] = {}
     for row in report.rows:
@@ -337,7 +334,7 @@ def _label(group_id: str, image: str, notable: dict) -> str:
     return f"{group_id}/{image}" + (f", {why}" if why else "")
 
 
-def _group_rows(report: AnyReport) -> Callable[[str], dict]:
+def _group_rows(report: Report) -> Callable[[str], dict]:
     """From a group's id to its row of the dataset."""
     from gift_peft.dataset.gift_i import load_gift_i
 
@@ -355,17 +352,12 @@ def _group_rows(report: AnyReport) -> Callable[[str], dict]:
     return find
 
 
-def _group_panels(report, find, group_id: str, labels: dict[str, str], loaded, options: dict) -> list[Panel]:
+def _group_panels(report, find, group_id: str, labels: dict[str, str], model: DepthModel) -> list[Panel]:
     from gift_peft.reports.panels import group_panels, scene_panels
 
-    if isinstance(report, BoosterReport):
-        return scene_panels(report.about, group_id, labels, loaded.model, **options)
-    row = find(group_id)
-    missing = [image for image in labels if image not in row["image_names"]]
-    if missing:
-        raise ValueError(f"group {group_id} no longer has image {missing[0]}")
-    numbers = {row["image_names"].index(image): label for image, label in labels.items()}
-    return group_panels(row, numbers, loaded.model, reference=report.reference, **options)
+    if report.dataset == "booster":
+        return scene_panels(report.about, group_id, labels, model, report.protocol["name"])
+    return group_panels(find(group_id), labels, model, report.protocol["name"], report.reference)
 
 
 def _zero_shot(

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gift_peft.evaluation.results import load_report
-from gift_peft.evaluation.tables import AnyReport
+from gift_peft.evaluation.results import Report
 from gift_peft.files import portable_name, read_yaml
 
 
@@ -19,14 +18,14 @@ class SavedRun:
         arguments (`dict`): config.yaml; empty for an evaluation alone.
         history (`list[dict]`): the rows of metrics.jsonl; empty before the base was measured.
         record (`dict`, *optional*): adapter/gift.json; None before an adapter was written.
-        evaluations (`dict[str, GiftIReport | BoosterReport]`): saved ones, by the name of their folder.
+        evaluations (`dict[str, Report]`): saved ones, by the name of their folder.
     """
 
     path: Path
     arguments: dict = field(default_factory=dict)
     history: list[dict] = field(default_factory=list)
     record: dict | None = None
-    evaluations: dict[str, AnyReport] = field(default_factory=dict)
+    evaluations: dict[str, Report] = field(default_factory=dict)
 
     @property
     def adapter(self) -> Path | None:
@@ -59,7 +58,7 @@ def read_run(path: str | Path) -> SavedRun:
     if path.suffix in (".yaml", ".yml") and path.is_file():
         return SavedRun(path, read_yaml(path))
     if (path / "metrics.json").is_file():
-        return SavedRun(path, evaluations={path.name: load_report(path)})
+        return SavedRun(path, evaluations={path.name: Report.load(path)})
     if not ((path / "config.yaml").is_file() or (path / "metrics.jsonl").is_file()):
         raise FileNotFoundError(
             f"{path}: neither a run (config.yaml, metrics.jsonl), an evaluation (metrics.json) nor a YAML file of one"
@@ -73,7 +72,7 @@ def read_run(path: str | Path) -> SavedRun:
     if record.is_file():
         run.record = _json(record, record.read_text(encoding="utf-8"))
     for folder in sorted(child for child in path.iterdir() if (child / "metrics.json").is_file()):
-        run.evaluations[folder.name] = load_report(folder)
+        run.evaluations[folder.name] = Report.load(folder)
     return run
 
 

@@ -7,10 +7,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from gift_peft.evaluation.scoring import resize_prediction
+from gift_peft.evaluation.alignment import resize_prediction
 from gift_peft.images import list_images, read_image
-from gift_peft.models.loading import load_model, predict_depth
-from gift_peft.models.pixels import to_pixel_values
+from gift_peft.models.loading import DepthModel
 from gift_peft.reports.figures import prediction_row, save_grid
 from gift_peft.reports.saved_run import SavedRun
 
@@ -69,18 +68,21 @@ def draw_zero_shot(
     bar = tqdm(total=len(files) * (len(folders) + 1), desc="zero-shot", unit="image", disable=None)
     with bar:
         for number, folder in enumerate(folders.values()):
-            loaded = load_model(
+            model = DepthModel.from_pretrained(
                 run.arguments["model_name_or_path"],
                 folder,
                 revision=run.arguments.get("model_revision"),
                 size=run.arguments.get("size"),
                 device=device,
             )
-            kind = kind or loaded.kind
-            if number == 0:
-                with loaded.model.disable_adapter():
-                    _predict(loaded, files, pictures, maps, bar)
-            _predict(loaded, files, pictures, maps, bar)
+            kind = kind or model.kind
+            for predict in (model.predict_base, model.predict) if number == 0 else (model.predict,):
+                for file, picture, own in zip(files, pictures, maps, strict=True):
+                    depth = predict(model.inputs([read_image(file)]))[0]
+                    if not torch.isfinite(depth).all():
+                        raise ValueError(f"{file}: the prediction has NaN or infinite values")
+                    own.append(resize_prediction(depth, (picture.height, picture.width)).astype(np.float32))
+                    bar.update()
     if kind is None:
         raise ValueError(f"{run.path}: nothing says whether the base predicts depth or inverse depth")
     rows = [
@@ -89,15 +91,6 @@ def draw_zero_shot(
     ]
     for path in paths:
         save_grid(rows, ("RGB", "base", *(f"{step:,} steps" for step in folders)), path)
-
-
-def _predict(loaded, files: list[Path], pictures: list, maps: list[list[np.ndarray]], bar: tqdm) -> None:
-    for file, picture, own in zip(files, pictures, maps, strict=True):
-        depth = predict_depth(loaded.model, to_pixel_values([read_image(file)], loaded.processor, loaded.size))[0]
-        if not torch.isfinite(depth).all():
-            raise ValueError(f"{file}: the prediction has NaN or infinite values")
-        own.append(resize_prediction(depth, (picture.height, picture.width)).astype(np.float32))
-        bar.update()
 
 
 def _fit(image):

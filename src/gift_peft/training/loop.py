@@ -24,7 +24,7 @@ from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
 from gift_peft.dataset.loader import PreparedGroups, epoch_order
 from gift_peft.dataset.tensors import Group
 from gift_peft.group_step import GroupStep
-from gift_peft.models.loading import load_base
+from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.models.pixels import resolve_size
 from gift_peft.reports.model_card import model_card
 from gift_peft.training import checkpoints, upload, validation
@@ -146,9 +146,8 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
             checkpoints.prune_checkpoints(output, state.step, args.checkpoints_total_limit, args.checkpoint_at_steps)
         accelerator.wait_for_everyone()
 
-    measure = partial(
-        validation.measure, step.model, validation_groups, args.booster_root, kind, processor, size, accelerator
-    )
+    model = DepthModel(step.model, processor, size, kind)
+    measure = partial(validation.measure, model, validation_groups, args.booster_root, accelerator)
     signum = _fit(state, schedule, step, optimizer, train_groups, measure, save, save_checkpoint, output)
 
     # finish

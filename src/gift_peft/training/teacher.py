@@ -24,8 +24,8 @@ from gift_peft.dataset.proxies import (
 )
 from gift_peft.dataset.rows import parsed
 from gift_peft.models.identity import teacher_id, teacher_revision
-from gift_peft.models.loading import load_base, predict_depth
-from gift_peft.models.pixels import pixel_settings, resolve_size, to_pixel_values
+from gift_peft.models.loading import DepthModel
+from gift_peft.models.pixels import pixel_settings
 from gift_peft.rules import GroupPictures
 
 if TYPE_CHECKING:
@@ -66,17 +66,13 @@ def make_proxies(
         ValueError, OSError: in every process, one line naming the file, or group and image: stale proxies, NaN
             predictions, unreadable data, a folder that cannot be written.
     """
-    from gift_peft.adapters.recipes import RECIPES
-
     state = accelerator or PartialState(cpu=parse_flag_from_env("ACCELERATE_USE_CPU"))
     identity = teacher_id(base, revision)
     pinned = teacher_revision(base, revision)
-    model, processor = load_base(base, revision)
-    size = resolve_size(size, RECIPES.get(model.config.model_type), processor, model.config)
-    model.to(state.device)
+    model = DepthModel.from_pretrained(base, revision=revision, size=size, device=state.device)
     folder = Path(proxies_dir or default_proxies_dir(dataset_path, identity)) / identity
-    command = proxies_command(base, dataset_path, f"{size[0]}x{size[1]}", proxies_dir, revision)
-    header = make_header(identity, pinned, size, pixel_settings(processor))
+    command = proxies_command(base, dataset_path, "x".join(map(str, model.size)), proxies_dir, revision)
+    header = make_header(identity, pinned, model.size, pixel_settings(model.processor))
     problem = None
     try:
         for split in splits or gift_i_splits(dataset_path):
@@ -89,7 +85,7 @@ def make_proxies(
                 path = folder / split / f"{row.group_id}.safetensors"
                 expected = header | picture_digests(row)
                 if overwrite or not _is_current(path, expected, row.names, command):
-                    write_proxies(path, expected, *_predict_row(model, processor, row, size, batch_size))
+                    write_proxies(path, expected, *_predict_row(model, row, batch_size))
     except (ValueError, OSError) as error:
         problem = error
     _raise_everywhere(problem, state)
@@ -106,18 +102,16 @@ def _is_current(path: Path, expected: dict, names: Sequence[str], command: str) 
     return True
 
 
-def _predict_row(model, processor, row: GroupPictures, size: tuple[int, int], batch_size: int):
+def _predict_row(model: DepthModel, row: GroupPictures, batch_size: int):
     """(proxies (N, h, w), reference (h, w) or None) of one row; ValueError naming the image of a bad prediction."""
     names, images = row.names, row.images
-    proxies = predict_depth(model, to_pixel_values(images, processor, size), batch_size)
+    proxies = model.predict(model.inputs(images), batch_size)
     reference = None
     if row.reference is not None:
-        reference = predict_depth(model, to_pixel_values([row.reference], processor, size))[0]
+        reference = model.predict(model.inputs([row.reference]))[0]
     for name, proxy in [*zip(names, proxies, strict=True), ("the reference", reference)]:
-        if proxy is not None and tuple(proxy.shape) != tuple(size):
-            raise ValueError(
-                f"the model predicts {tuple(proxy.shape)} for images of {tuple(size)}; they must be equal"
-            )
+        if proxy is not None and tuple(proxy.shape) != model.size:
+            raise ValueError(f"the model predicts {tuple(proxy.shape)} for images of {model.size}; they must be equal")
         if proxy is not None and not torch.isfinite(proxy).all():
             raise ValueError(f"group {row.group_id}, {name}: the teacher's prediction has NaN or infinite values")
     return proxies, reference

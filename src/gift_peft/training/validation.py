@@ -4,15 +4,14 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from accelerate import Accelerator
-from peft import PeftModel
 from tqdm import tqdm
 
 from gift_peft.dataset.loader import PreparedGroups
+from gift_peft.evaluation.evaluate import evaluate_booster, evaluate_gift_i
 from gift_peft.evaluation.metrics import METRICS
-from gift_peft.evaluation.on_booster import evaluate_booster
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i
 from gift_peft.evaluation.results import REGIONS
 from gift_peft.losses import GeometryConsistencyError
+from gift_peft.models.loading import DepthModel
 from gift_peft.training.start import Interrupted
 
 
@@ -51,12 +50,9 @@ def measure_base(groups: PreparedGroups, lambda_c: float, quiet: bool) -> Iterat
 
 
 def measure(
-    model: PeftModel,
+    model: DepthModel,
     groups: Sequence | None,
     booster_root: str | None,
-    kind: str,
-    processor: Any,
-    size: tuple[int, int],
     accelerator: Accelerator,
     is_due: bool,
     should_stop: Callable[[], Any],
@@ -70,7 +66,7 @@ def measure(
     if booster_root is not None:
         keys += ["booster_tom_rmse", "booster_other_rmse"]
     row = dict.fromkeys(keys)
-    options = {"kind": kind, "baseline": False, "accelerator": accelerator, "progress": False}
+    options = {"baseline": False, "accelerator": accelerator, "progress": False}
     if is_due and groups is not None:
         # Several processes evaluate their shares apart, and would have to agree after every group.
         alone = accelerator.num_processes == 1
@@ -78,6 +74,6 @@ def measure(
         row |= {f"val_{r}_{m}": report.summary[r][m] for r in REGIONS for m in METRICS}
         row["val_gce"] = report.gce["adapted"]
     if is_due and booster_root is not None:
-        report = evaluate_booster(booster_root, model, processor=processor, size=size, **options)
+        report = evaluate_booster(booster_root, model, **options)
         row |= {f"booster_{region}_rmse": report.summary[region]["rmse"] for region in ("tom", "other")}
     return row

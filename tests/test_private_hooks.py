@@ -23,7 +23,8 @@ HOOKS = {  # private name: library, where we use it, what for
     "_compiled_call_impl": ("torch", "memory.py", "leaves compiled blocks alone"),
     "_DropoutNd": ("torch", "group_step.py", "finds every kind of dropout"),
     "_BatchNorm": ("torch", "group_step.py", "finds every kind of batch normalization"),
-    "_actions": ("argparse", "prepare/settings.py", "the options that a YAML file may name"),
+    "_actions": ("argparse", "options.py", "shows each option of the training arguments in one spelling"),
+    "_option_string_actions": ("argparse", "options.py", "tells an option from a value"),
 }
 
 
@@ -115,3 +116,4 @@ def test_argparse():
     parser = argparse.ArgumentParser()
     parser.add_argument("--size")
     assert "size" in {action.dest for action in parser._actions}, gone("_actions")
+    assert "--size" in parser._option_string_actions, gone("_option_string_actions")

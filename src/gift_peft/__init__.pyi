@@ -8,9 +8,9 @@ from gift_peft.adapters.scale import set_adapter_scale as set_adapter_scale
 from gift_peft.dataset.gift_i import GiftI as GiftI
 from gift_peft.dataset.gift_i import load_gift_i as load_gift_i
 from gift_peft.evaluation.alignment import align as align
+from gift_peft.evaluation.evaluate import evaluate_booster as evaluate_booster
+from gift_peft.evaluation.evaluate import evaluate_gift_i as evaluate_gift_i
 from gift_peft.evaluation.metrics import depth_metrics as depth_metrics
-from gift_peft.evaluation.on_booster import evaluate_booster as evaluate_booster
-from gift_peft.evaluation.on_gift_i import evaluate_gift_i as evaluate_gift_i
 from gift_peft.evaluation.protocols import PROTOCOLS as PROTOCOLS
 from gift_peft.group_step import GroupStep as GroupStep
 from gift_peft.losses import GeometryConsistencyError as GeometryConsistencyError
@@ -19,6 +19,7 @@ from gift_peft.losses import gift_loss as gift_loss
 from gift_peft.losses import group_consistency_loss as group_consistency_loss
 from gift_peft.losses import masked_l1 as masked_l1
 from gift_peft.losses import self_distillation_loss as self_distillation_loss
+from gift_peft.models.loading import DepthModel as DepthModel
 from gift_peft.models.metric3d import Metric3DConfig as Metric3DConfig
 from gift_peft.models.metric3d import Metric3DForDepthEstimation as Metric3DForDepthEstimation
 from gift_peft.models.vggt import VggtConfig as VggtConfig

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -80,7 +80,7 @@ class GroupStep:
         self.lambda_d = lambda_d
         self.micro_batch_size = micro_batch_size
         self.retain = retain
-        self.accelerator = accelerator
+        self.accelerator: Any = accelerator  # accelerate does not say that `reduce` of a tensor is a tensor
         self.mixed_precision = _mixed_precision(model, accelerator)
         self.phase: Callable[[str], AbstractContextManager] = nullcontext
         self._rank = accelerator.process_index if accelerator else 0
@@ -191,7 +191,7 @@ class GroupStep:
         """The last of this process's micro-batches that keep their graphs, whole ones only."""
         mine = self._mine(batches)
         if self.budget is None:  # so many images of the group
-            candidates, room = range(len(batches)), self.retain
+            candidates, room = range(len(batches)), int(self.retain)
         else:  # so many images of this process
             candidates, room = mine, self.budget.images(pixel_values, canvas) if mine else 0
         first = len(batches)
@@ -210,7 +210,8 @@ class GroupStep:
             leaf = canvas.requires_grad_()
             loss = gift_loss(leaf, target, mask, self.lambda_c, self.lambda_d, valid)
             (gradient,) = torch.autograd.grad(loss.total, leaf)
-        return GiftLoss(*(term.detach() for term in loss[:3]), loss.num_pairs), gradient
+        terms = loss.total.detach(), loss.consistency.detach(), loss.distillation.detach()
+        return GiftLoss(*terms, loss.num_pairs), gradient
 
     def _replay(
         self,

@@ -15,6 +15,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import psutil
 import torch
@@ -58,7 +59,7 @@ class GraphBudget:
 
     def images(self, pixel_values: Tensor, canvas: Tensor) -> int:
         """How many of these images' graphs may be kept, beside their predictions `canvas` (N,H,W)."""
-        room = self.bytes - GROUP_TENSORS * canvas.nbytes
+        room = (self.bytes or 0) - GROUP_TENSORS * canvas.nbytes
         return max(0, room // self._image_bytes[tuple(pixel_values.shape[1:])])
 
     def halve(self, pixel_values: Tensor, num_images: int) -> None:
@@ -166,7 +167,7 @@ def cast_frozen_once(model: nn.Module, dtype: torch.dtype = torch.bfloat16) -> I
     casts: dict[nn.Module, Tensor] = {}
     weights: dict[nn.Module, nn.Parameter] = {}
 
-    def lend(module: nn.Module, args: tuple) -> None:
+    def lend(module: Any, args: tuple) -> None:
         weight = module.weight
         if torch.is_autocast_enabled(weight.device.type):
             if module not in casts:
@@ -174,7 +175,7 @@ def cast_frozen_once(model: nn.Module, dtype: torch.dtype = torch.bfloat16) -> I
             weights[module] = weight
             module._parameters["weight"] = casts[module]
 
-    def take_back(module: nn.Module, args: tuple, output: object) -> None:
+    def take_back(module: Any, args: tuple, output: object) -> None:
         if module in weights:
             module._parameters["weight"] = weights.pop(module)
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     Array = np.ndarray | torch.Tensor
 
+RULE = "surface 1"  # changes with whatever changes a target or a fill: stored targets of another rule are refused
 MODELS = ("auto", "plane", "quantile")
 KINDS = ("depth", "inverse_depth")
 SURFACES = (None, "mirror", "transparent")

@@ -27,6 +27,7 @@ from gift_peft.group_step import GroupStep
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.models.pixels import resolve_size
 from gift_peft.reports.model_card import model_card
+from gift_peft.rules import check_pair
 from gift_peft.training import checkpoints, upload, validation
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.checkpoints import State, write_metrics
@@ -191,6 +192,9 @@ def _groups(
     for split in ("train", "validation"):
         if split in splits:
             rows = load_gift_i(args.dataset_name, split, teacher=args.model_name_or_path, **places)
+            if split == "train":
+                for group_id, names in zip(rows["group_id"], rows["image_names"], strict=True):
+                    check_pair(group_id, len(names))
             groups[split] = PreparedGroups(rows, processor, size, args.dataloader_num_workers, cache_dir)
     return groups
 

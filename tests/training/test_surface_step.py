@@ -193,5 +193,3 @@ def test_two_processes_give_the_gradient_of_one(answers, name):
 
 def test_what_one_process_stumbles_over_all_report(answers):
     assert "the prediction of image 0 has NaN" in answers[0]["bad"] and answers[0]["bad"] == answers[1]["bad"]
-
-

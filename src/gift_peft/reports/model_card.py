@@ -39,7 +39,7 @@ PLAIN_METRICS = {"mae": "MAE", "abs_rel": "AbsRel", "rmse": "RMSE", "delta1": "d
 DEFAULTS = {
     "lora_rank": 8,
     "head": "full",
-    "lambda_c": 1,
+    "target": "consensus",
     "lambda_d": 1,
     "learning_rate": 2e-5,
     "lr_scheduler_type": "constant",
@@ -135,6 +135,8 @@ def model_card(
     if record is not None and backbone and not (name == backbone.hub_id and is_hub_id(name)):
         backbone = None
     settings = DEFAULTS | dict(arguments)
+    is_surface = settings["target"] == "surface"
+    settings.setdefault("lambda_c", 2 if is_surface else 1)
     for key in ("lambda_c", "lambda_d", "learning_rate", "weight_decay"):
         settings[key] = f"{float(settings[key]):g}"
     about = record or (vars(backbone) if backbone else {})
@@ -150,6 +152,8 @@ def model_card(
         "size": f"{size[0]}x{size[1]}" if size else arguments.get("size") or "476x644",
         "precision": (record or arguments).get("mixed_precision") or "bf16",
         "run_length": run_length(arguments),
+        "surface_target": is_surface,
+        "per_update": _per_update(settings, record),
         "tables": "\n".join(tables).strip(),
         "validation": _validation(record),
         "retention": _retention(record, reports),
@@ -183,6 +187,16 @@ def run_length(arguments: Mapping[str, Any]) -> str:
 
 def _row(label: str, base: float | None, adapted: float | None) -> tuple[str, str, str, str]:
     return label, number(base), number(adapted), _percent(base, adapted)
+
+
+def _per_update(settings: Mapping, record: Mapping | None) -> str:
+    """What an update takes, in words."""
+    if settings["target"] != "surface":
+        return "one update per group"
+    images = settings.get("per_device_train_batch_size", 4) * settings.get("gradient_accumulation_steps", 1)
+    if record is not None:
+        images *= record["num_processes"]
+    return f"{images} images of any groups per update"
 
 
 def _percent(base: float | None, adapted: float | None) -> str:

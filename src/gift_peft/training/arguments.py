@@ -65,6 +65,7 @@ OWN = {
         "surface_tau",
     ),
 }
+SELECTORS = ("gce", "normalized_gce", "tom_rmse")
 LAMBDA_C = {"consensus": 1.0, "surface": 2.0}
 
 RANGES = (
@@ -248,6 +249,10 @@ class GiftTrainingArguments:
         """Refuse what only the other objective takes; settle what has a default for each."""
         if self.target not in OWN:
             raise ValueError(f"target: {self.target!r} is neither consensus nor surface")
+        if self.metric_for_best_model not in SELECTORS:
+            raise ValueError(
+                f"metric_for_best_model: expected {', '.join(SELECTORS)}, got {self.metric_for_best_model}"
+            )
         defaults = {f.name: f.default for f in fields(self)}
         for name in self._foreign():
             if getattr(self, name) != defaults[name]:

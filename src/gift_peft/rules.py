@@ -81,16 +81,18 @@ class GroupPictures:
 
 
 def parse_group(
-    record: Mapping[str, Any],
+    record: Mapping[str, Any] | GroupPictures,
     rgb: Callable[[Any, str], Image.Image] = to_rgb,
     mask: Callable[[Any, str], np.ndarray] = to_mask,
     depth: Callable[[Any, str], np.ndarray] = lambda item, _: np.asarray(item),
 ) -> GroupPictures:
-    """A record with the dataset's columns as `GroupPictures`; of those after the masks, any may be missing.
+    """A record with the dataset's columns as `GroupPictures`, which itself is given back as it is.
 
-    `rgb`, `mask` and `depth` convert an item, given how messages call it; the defaults take pictures, as rows hold
-    them. Raises ValueError as they do, and as `GroupPictures`.
+    Of the columns after the masks, any may be missing. `rgb`, `mask` and `depth` convert an item, given how messages
+    call it; the defaults take pictures, as rows hold them. Raises ValueError as they do, and as `GroupPictures`.
     """
+    if isinstance(record, GroupPictures):
+        return record
     group_id, names = record["group_id"], list(record["image_names"])
 
     def convert(column: str, kind: str, function: Callable[[Any, str], Any]) -> list:

@@ -114,10 +114,12 @@ def test_inside_the_package_a_group_is_parsed_once(prepared, base_dir, monkeypat
     row = collate_group(rows[0], tiny_processor(), SIZE)  # a dict may have been changed, so it is parsed where taken
     assert torch.equal(row.mask, whole.mask) and torch.equal(row.pixel_values, whole.pixel_values)
     assert parsed([rows]) == [rows]
+    options = {"kind": "depth", "processor": tiny_processor(), "size": SIZE, "progress": False}
     for read in (
         lambda: dataset_fingerprint(rows),
         lambda: make_proxies(base_dir, prepared, ["validation"], SIZE),
         lambda: GroupCache(rows, tiny_processor(), SIZE, None).read(0),
+        lambda: evaluate_gift_i(rows, lambda pixels: pixels[:, 0], reference="depth", **options),
     ):
         made.clear()
         read()

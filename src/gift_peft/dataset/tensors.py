@@ -50,7 +50,7 @@ def collate_group(row: dict | GroupPictures, processor, size: tuple[int, int]) -
     Raises ValueError naming the group and image for a mask of another size, a mask that is not one, an image that is
     not 8-bit RGB, and proxies made at another size.
     """
-    pictures = row if isinstance(row, GroupPictures) else parse_group(row)
+    pictures = parse_group(row)
     arrays = resize_pictures(pictures, processor, size)
     proxies = pictures.proxies, pictures.reference_proxy
     group = to_group(pictures.group_id, pictures.names, pictures.surface, arrays, proxies, processor, size)

@@ -77,7 +77,7 @@ def run_demo(
         raise KeyboardInterrupt
 
     model = DepthModel.from_pretrained(out / "base", out / "adapter")
-    groups = load_gift_i(out / "gift-i", "validation")
+    groups = parsed(load_gift_i(out / "gift-i", "validation"))
     reports = {}
     for reference in ("proxy", "depth"):
         report = evaluate_gift_i(groups, model, reference=reference)
@@ -85,7 +85,7 @@ def run_demo(
         report.save(out / f"evaluation-{reference}")
         reports[reference] = report
     before_after(_panels(groups, reports["depth"], model), out / "before_after.png")
-    write_whole(out / "validation.html", validation_page(parsed(groups)))
+    write_whole(out / "validation.html", validation_page(groups))
     write_whole(out / "report.md", _markdown(reports, args))
     _print_summary(reports, out)
     return reports

@@ -18,6 +18,7 @@ import torch
 from tqdm import tqdm
 
 from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.dataset.rows import parsed
 from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.alignment import align, known, resize_prediction
 from gift_peft.evaluation.booster_scenes import TOM_CLASSES, BoosterScene, GroundTruth, find_booster, read_ground_truth
@@ -37,7 +38,7 @@ from gift_peft.evaluation.stored_predictions import PredictionFolder
 from gift_peft.losses import GeometryConsistencyError, prediction_spread
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import resize_mask
-from gift_peft.rules import KINDS
+from gift_peft.rules import KINDS, parse_group
 
 REFERENCES = {"proxy": "native", "depth": "gift"}  # and the protocol that goes with each
 NO_PROXY, NO_DEPTH = "without a treated reference", "without true depth"  # why a row is skipped
@@ -96,6 +97,7 @@ def evaluate_gift_i(
         raise ValueError("evaluate_gift_i needs a model")
     if isinstance(dataset, str | Path):
         dataset = load_gift_i(dataset, "validation")
+    dataset = parsed(dataset)
     if size is None and not isinstance(model, DepthModel):
         size = _proxies_size(dataset)
     depth_model = DepthModel.of(model, teacher=teacher, processor=processor, size=size, kind=kind)
@@ -127,11 +129,11 @@ def evaluate_gift_i(
 
 def _proxies_size(dataset: Any) -> tuple[int, int] | None:
     """(height, width) of the proxies attached to a dataset, if there are any."""
-    first = dataset[0] if len(dataset) else None
-    if first is None or isinstance(first, Group):
+    if len(dataset) == 0 or isinstance(first := dataset[0], Group):
         return None
-    proxies = [first[name] for name in ("proxies", "reference_proxy") if first.get(name) is not None]
-    return tuple(np.asarray(proxies[0]).shape[-2:]) if proxies else None
+    first = parse_group(first)
+    proxies = first.reference_proxy if first.proxies is None else first.proxies
+    return None if proxies is None else tuple(np.asarray(proxies).shape[-2:])
 
 
 def evaluate_booster(

@@ -13,15 +13,20 @@ from gift_peft.evaluation.samples import Sample, booster_sample, gift_i_sample, 
 from gift_peft.images import read_image
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.figures import Panel
+from gift_peft.rules import GroupPictures, parse_group
 
 
 def group_panels(
-    row: dict, labels: Mapping[str, str], model: DepthModel, protocol: str | None = None, reference: str = "depth"
+    row: dict | GroupPictures,
+    labels: Mapping[str, str],
+    model: DepthModel,
+    protocol: str | None = None,
+    reference: str = "depth",
 ) -> list[Panel]:
     """Observations of a group of GIFT-I as rows of `before_after`.
 
     Args:
-        row: of `load_gift_i`.
+        row: of `load_gift_i`, parsed or not.
         labels: {name of the image: what stands above it}.
         model: with an adapter or a teacher.
         protocol, reference: as in `evaluate_gift_i`.
@@ -29,9 +34,10 @@ def group_panels(
     Raises:
         ValueError: the group has no such image, or no such reference.
     """
-    pictures = dict(zip(row["image_names"], row["images"], strict=True))
-    _check(f"group {row['group_id']}", labels, pictures)
-    sample = gift_i_sample(row, model, {"base": model.predict_base, "adapted": model.predict}, reference)
+    group = parse_group(row)
+    pictures = dict(zip(group.names, group.images, strict=True))
+    _check(f"group {group.group_id}", labels, pictures)
+    sample = gift_i_sample(group, model, {"base": model.predict_base, "adapted": model.predict}, reference)
     return _panels(sample, labels, pictures, model, protocol or REFERENCES[reference])
 
 

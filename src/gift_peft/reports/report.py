@@ -28,6 +28,7 @@ from gift_peft.reports.figures import Panel, before_after, error_maps
 from gift_peft.reports.model_card import model_card
 from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_names
 from gift_peft.reports.zero_shot import checkpoint_folders, draw_zero_shot
+from gift_peft.rules import GroupPictures
 
 COMPARED_GROUPS = 40  # in compare.html, one observation each: a browser has to open it
 HEADINGS = {
@@ -334,17 +335,17 @@ def _label(group_id: str, image: str, notable: dict) -> str:
     return f"{group_id}/{image}" + (f", {why}" if why else "")
 
 
-def _group_rows(report: Report) -> Callable[[str], dict]:
-    """From a group's id to its row of the dataset."""
+def _group_rows(report: Report) -> Callable[[str], GroupPictures]:
+    """From a group's id to the group, as it is in the dataset."""
     from gift_peft.dataset.gift_i import load_gift_i
+    from gift_peft.dataset.rows import parsed
 
     about = report.about
-    rows = load_gift_i(
-        about["dataset"], about.get("split") or "validation", dataset_revision=about.get("dataset_revision")
-    )
+    split = about.get("split") or "validation"
+    rows = parsed(load_gift_i(about["dataset"], split, dataset_revision=about.get("dataset_revision")))
     index = {group_id: number for number, group_id in enumerate(rows.select_columns(["group_id"])["group_id"])}
 
-    def find(group_id: str) -> dict:
+    def find(group_id: str) -> GroupPictures:
         if group_id not in index:
             raise ValueError(f"{about['dataset']} no longer has group {group_id}")
         return rows[index[group_id]]

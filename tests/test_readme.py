@@ -106,7 +106,7 @@ def run(command: str) -> None:
     program, verb, *argv = shlex.split(command)
     assert program == "gift-peft", command
     argv = ["demo/base" if word == HUB_BASE else word for word in argv]
-    more = QUICK if verb == "train" and "--help" not in argv else []
+    more = {"train": QUICK, "proxies": QUICK[1:]}.get(verb, []) if "--help" not in argv else []
     with pytest.raises(SystemExit) as end:
         main([verb, *argv, *more])
     assert not end.value.code, command

@@ -150,3 +150,13 @@ def test_the_example_configurations_are_the_papers_settings(name, request):
         if key not in ("model_name_or_path", "dataset_name", "output_dir", "size", "mixed_precision"):
             assert getattr(args, key) == getattr(paper, key), key
     assert (args.size, args.mixed_precision) == ("476x644", "bf16")
+
+
+@pytest.mark.parametrize("name", ["depth_anything_v2_large", "vggt_1b", "metric3d_v2_giant"])
+def test_the_configurations_with_surface_targets_keep_the_papers_other_settings(name, request):
+    folder = request.config.rootpath / "examples"
+    ours = parse_arguments(["--config", str(folder / f"{name}_surface.yaml")]).values()
+    paper = parse_arguments(["--config", str(folder / f"{name}.yaml")]).values()
+    differing = {key for key in ours.keys() & paper.keys() if ours[key] != paper[key]}
+    assert differing == {"target", "lambda_c", "output_dir", "config"}
+    assert ours["flip"] and ours["fills"] == 6

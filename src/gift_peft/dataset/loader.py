@@ -71,7 +71,9 @@ class PreparedGroups:
 
 
 class PreparedImages:
-    """The images of groups, one by one: groups of one, with their surface targets. Their groups are not kept.
+    """The images of groups, one by one: groups of one, with their surface targets.
+
+    Of a group in the cache only this image is read; without a cache each image decodes its whole group.
 
     Args:
         groups: of rows with surface targets, as `load_gift_i(..., teacher=..., surface=...)` gives them.

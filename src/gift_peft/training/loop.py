@@ -282,8 +282,8 @@ def _fit(
             if schedule.checkpoint_is_due(state.step) and not schedule.row_is_due(state):
                 save_checkpoint()
             progress.step(losses.total, losses.consistency)
-            if state.step == first and str(objective):
-                progress.say(str(objective))
+            if state.step == first and (note := objective.memory_note()):
+                progress.say(note)
         if signum:
             save_checkpoint()
     return signum

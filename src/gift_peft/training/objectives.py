@@ -1,7 +1,7 @@
 """What an update takes and does: a group pulled to what it agrees on (the paper), or images pulled to their targets.
 
-Both offer the loop the same: `epoch_steps`, `feed(step)` with what each update takes, `accumulate` of that, which puts
-a gradient into `.grad`, and `first_look`, the base's own losses.
+Both offer the loop the same: `optimizer`, `epoch_steps`, `feed(step)` with what each update takes, `accumulate` of
+that, which puts a gradient into `.grad`, and `first_look`, the base's own losses.
 """
 
 import math
@@ -78,8 +78,8 @@ class Consensus:
             consistency = consistency if error.num_groups else 0.0
             yield Losses(self.step.lambda_c * consistency, consistency, 0.0, error.num_groups)
 
-    def __str__(self) -> str:
-        """What the first update has taught about memory."""
+    def memory_note(self) -> str:
+        """What the first update has taught about memory; empty where nothing."""
         return "" if self.step.budget is None else str(self.step.budget)
 
 
@@ -160,7 +160,8 @@ class Surface:
                 distance = float(masked_l1(proxy, target, region)) if region.any() else 0.0
                 yield Losses(self.step.lambda_c * distance, distance, 0.0, 0)
 
-    def __str__(self) -> str:
+    def memory_note(self) -> str:
+        """Nothing: what does not fit is halved when it turns out."""
         return ""
 
 

@@ -1,9 +1,13 @@
 """`gift-peft proxies`: its options. `teacher` beside it does the work."""
 
+from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import fields
+from itertools import chain
+from pathlib import Path
 
-from gift_peft.dataset.proxies import SurfaceSettings
+from gift_peft.dataset.proxies import SURFACE_SUFFIX, SurfaceSettings, read_header
+from gift_peft.files import write_whole
 from gift_peft.options import OptionParser, add_base, add_dataset
 from gift_peft.rules import KINDS
 from gift_peft.surface_targets import MODELS
@@ -33,6 +37,8 @@ def make_parser() -> OptionParser:
         options = {"choices": MODELS} if field.name == "surface_model" else {"type": type(field.default)}
         name = f"--{field.name.replace('_', '-')}"
         surface.add_argument(name, default=field.default, help=text[field.name], **options)
+    text = "a page to look at: each photo, its base prediction, surface target and treated reference"
+    surface.add_argument("--page", metavar="HTML", type=Path, help=text)
     surface.add_argument("--kind", choices=KINDS, help="what is predicted, if no recipe says it")
     return parser
 
@@ -41,8 +47,8 @@ def run(argv: Sequence[str]) -> int:
     parser = make_parser()
     args = parser.parse_args(argv)
     settings = SurfaceSettings(**{field.name: getattr(args, field.name) for field in fields(SurfaceSettings)})
-    if args.target is None and (settings != SurfaceSettings() or args.kind):
-        parser.error("fills, seed, kind and the surface options are for --target surface")
+    if args.target is None and (settings != SurfaceSettings() or args.kind or args.page):
+        parser.error("fills, seed, kind, page and the surface options are for --target surface")
     from gift_peft.training.teacher import make_proxies
 
     folder = make_proxies(
@@ -57,4 +63,20 @@ def run(argv: Sequence[str]) -> int:
         kind=args.kind,
     )
     print(f"{'Surface targets' if args.target else 'Proxies'}: {folder}")
+    if args.page:
+        print(f"Page: {_write_page(args, settings, folder)}")
     return 0
+
+
+def _write_page(args: Namespace, settings: SurfaceSettings, folder: Path) -> Path:
+    """The page of all splits asked for, whole or not at all."""
+    from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
+    from gift_peft.dataset.rows import parsed
+    from gift_peft.reports.targets_page import targets_page
+
+    places = {"proxies_dir": args.proxies_dir, "revision": args.revision, "surface": settings}
+    splits = args.splits or gift_i_splits(args.dataset)
+    groups = chain.from_iterable(parsed(load_gift_i(args.dataset, split, args.base, **places)) for split in splits)
+    kind = read_header(next(folder.glob(f"*/*{SURFACE_SUFFIX}.safetensors")))["kind"]
+    write_whole(args.page, targets_page(groups, kind))
+    return args.page

@@ -119,3 +119,11 @@ def test_debug_is_taken_out_and_lets_the_error_through(clean):
         run_verb(lambda argv: _raise("as it was"), ["--debug"])
     with pytest.raises(KeyError):  # a mistake of ours is never hidden
         run_verb(lambda argv: {}["a"], [])
+
+
+def test_what_follows_two_hyphens_is_taken_as_it_is():
+    parser = OptionParser("try", "A try.", "gift-peft try")
+    parser.add_argument("--out-dir")
+    parser.add_argument("files", nargs="+")
+    args = parser.parse_args(["--out_dir=a_b", "--", "--x_y.jpg", "x_y"])
+    assert (args.out_dir, args.files) == ("a_b", ["--x_y.jpg", "x_y"])

@@ -4,6 +4,7 @@ Each says who uses it and what it must do. A private name in src that is not in 
 """
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,14 @@ def test_transformers_models():
 
     assert hasattr(PreTrainedConfig(), "_attn_implementation"), gone("_attn_implementation")
     assert callable(getattr(PreTrainedModel, "_init_weights", None)), gone("_init_weights")
+
+
+def test_transformers_argument_parser_is_a_file_that_stands_alone():
+    """`training/arguments.py` executes it alone: with transformers would come our models, and torch."""
+    from gift_peft.training.arguments import make_parser
+
+    assert find_spec("transformers.hf_argparser") is not None, "transformers has moved HfArgumentParser"
+    assert make_parser().knows("--learning-rate")
 
 
 def test_torch_computes_with_what_lies_in_parameters():

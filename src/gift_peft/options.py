@@ -42,8 +42,9 @@ class OptionParser(argparse.ArgumentParser):
         return _hyphens(option) in self._option_string_actions
 
     def parse_known_args(self, args=None, namespace=None):
-        words = sys.argv[1:] if args is None else args
-        return super().parse_known_args([_hyphens(word) for word in words], namespace)
+        words = list(sys.argv[1:] if args is None else args)
+        end = words.index("--") if "--" in words else len(words)  # what follows is no option, whatever it looks like
+        return super().parse_known_args([*map(_hyphens, words[:end]), *words[end:]], namespace)
 
 
 class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):

@@ -1,5 +1,7 @@
 """`DepthModel`: what `predict` writes is what transformers' pipeline gives, whatever the backbone; pictures; kinds."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -77,6 +79,50 @@ def test_padding_of_the_processor_is_no_part_of_a_prediction():
     np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.parametrize("shape", [(1, 40), (40, 1), (1, 1)])
+def test_a_side_of_one_pixel_stays(shape):
+    processor = VggtImageProcessorPil(size={"height": SIZE[0], "width": SIZE[1]})
+    assert DepthModel(tiny_vggt(), processor, SIZE).depth_at(np.zeros((*shape, 3), np.uint8)).shape == shape
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((4, 5, 1), np.uint8),
+        np.zeros((3, 4, 5), np.uint8),
+        np.zeros((4, 5, 3)),
+        np.zeros((0, 0, 3), np.uint8),
+        np.zeros(5, np.uint8),
+        None,
+        torch.zeros(3),
+    ],
+)
+def test_what_is_no_picture_is_said_so(image):
+    processor = VggtImageProcessorPil(size={"height": SIZE[0], "width": SIZE[1]})
+    with pytest.raises(ValueError, match=r"the picture: .* is expected, not"):
+        DepthModel(tiny_vggt(), processor, SIZE).depth_at(image)
+
+
+@pytest.mark.parametrize("model_type", ["zoedepth", "depth_pro"])
+def test_native_units_stay_where_the_post_processing_would_change_them(model_type):
+    class Network(torch.nn.Module):
+        config = SimpleNamespace(model_type=model_type)
+
+        def forward(self, pixel_values):
+            return SimpleNamespace(predicted_depth=pixel_values.mean(1) + 2)
+
+    class Processor(VggtImageProcessorPil):
+        def post_process_depth_estimation(self, *args, **kwargs):
+            raise NameError("name 'tvF' is not defined")
+
+    processor = Processor(size={"height": SIZE[0], "width": SIZE[1]})
+    model = DepthModel(Network(), processor, SIZE, kind="depth")
+    depth = model.depth_at(picture(45, 61))
+    native = model.predict(model.inputs([picture(45, 61)]))
+    expected = torch.nn.functional.interpolate(native[None], (45, 61), mode="bicubic")[0, 0]
+    np.testing.assert_array_equal(depth, expected.numpy())
+
+
 def test_what_is_known_of_a_model():
     assert DepthModel(tiny_model()).kind == "inverse_depth"
     metric = DepthModel(tiny_model(depth_estimation_type="metric", max_depth=10))
@@ -98,7 +144,8 @@ def test_pictures_come_upright_in_8_bit_and_predictions_finite():
     turned = picture(45, 61)
     turned.getexif()[Image.ExifTags.Base.Orientation] = 6
     assert model.depth_at(turned).shape == (61, 45)
-    with pytest.raises(ValueError, match=r"the picture: \(H,W,3\) uint8 is expected, not float64"):
+    assert model.depth_at(np.zeros((45, 61), np.uint8)).shape == (45, 61)
+    with pytest.raises(ValueError, match=r"the picture: \(H,W,3\) uint8 is expected, not \(45, 61, 3\) float64"):
         model.depth_at(np.zeros((45, 61, 3)))
     with pytest.raises(ValueError, match="the picture: the prediction has NaN or infinite values"):
         DepthModel(lambda x: x[:, 0] / 0, tiny_processor(), SIZE).depth_at(picture())

@@ -75,6 +75,11 @@ class Report:
         """What GCE is called: the reflected content of a Booster scene stays the same, only the light changes."""
         return "illumination GCE" if self.dataset == "booster" else "GCE"
 
+    @property
+    def illumination_gce(self) -> dict:
+        """`gce` of Booster under the name that it has in metrics.json, and had here before both reports were one."""
+        return self.gce
+
     def to_dict(self) -> dict:
         """Everything but the rows, in JSON types; NaN and infinity become None."""
         return jsonable({key: getattr(self, name) for name, key in _json_keys(self.dataset).items()})

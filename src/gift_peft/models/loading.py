@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from torch import nn
 
 from gift_peft.files import reason
 from gift_peft.images import read_image
@@ -26,6 +27,8 @@ from gift_peft.models.identity import check_base_name, teacher_revision
 from gift_peft.models.pixels import resolve_size, to_pixel_values
 from gift_peft.rules import KINDS
 
+# Depth Pro's post-processing turns inverse depth into depth, and ZoeDepth's needs torchvision: native units are kept.
+RESIZED_HERE = {"zoedepth", "depth_pro"}
 METRIC_MODELS = {"zoedepth", "depth_pro", "prompt_depth_anything"}  # they predict metres without saying so
 
 
@@ -187,10 +190,11 @@ class DepthModel:
     ) -> np.ndarray:
         """Depth of a picture at its own size, as `gift-peft predict` writes it.
 
-        The image processor's own `post_process_depth_estimation` brings it there, as in transformers' pipeline.
+        The image processor's own `post_process_depth_estimation` brings it there, as in transformers' pipeline, except
+        for ZoeDepth and Depth Pro, whose own does more than that: there it is the bicubic resize of the others.
 
         Args:
-            image: a file, an RGB picture, or an array (H,W,3) uint8.
+            image: a file, an RGB picture, or an array (H,W,3) or grey (H,W), uint8.
             focal_length (*optional*): fx or (fx, fy) of the camera in pixels of the picture, where the processor takes
                 one (Metric3D, whose depth is then in metres of that camera).
             base (`bool`): depth of the base alone.
@@ -204,9 +208,11 @@ class DepthModel:
         """
         name = str(image) if isinstance(image, str | Path) else "the picture"
         if isinstance(image, np.ndarray):
-            if image.dtype != np.uint8:
-                raise ValueError(f"{name}: (H,W,3) uint8 is expected, not {image.dtype}")
+            if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2 or not image.size:
+                raise ValueError(f"{name}: (H,W,3) uint8 is expected, not {image.shape} {image.dtype}")
             image = Image.fromarray(image)
+        elif not isinstance(image, str | Path | Image.Image):
+            raise ValueError(f"{name}: a path, a PIL picture or a uint8 array is expected, not {type(image).__name__}")
         picture = read_image(image, name)
         post_process, options = self.processor.post_process_depth_estimation, {}
         if focal_length is not None:
@@ -218,8 +224,12 @@ class DepthModel:
             output = SimpleNamespace(predicted_depth=output)
         if not torch.isfinite(output.predicted_depth).all():
             raise ValueError(f"{name}: the prediction has NaN or infinite values")
-        (depth,) = post_process(output, target_sizes=[(picture.height, picture.width)], **options)
-        return depth["predicted_depth"].float().cpu().numpy()
+        size = picture.height, picture.width
+        if getattr(getattr(self.network, "config", None), "model_type", None) in RESIZED_HERE:
+            depth = nn.functional.interpolate(output.predicted_depth[None], size, mode="bicubic")
+        else:
+            depth = post_process(output, target_sizes=[size], **options)[0]["predicted_depth"]
+        return depth.float().cpu().numpy().reshape(size)  # transformers squeezes a side of one pixel away
 
     def _predict(self, pixel_values: torch.Tensor, batch_size: int, base: bool) -> torch.Tensor:
         outputs = (self._forward(batch, base) for batch in pixel_values.split(batch_size))

@@ -13,18 +13,19 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from gift_peft.captures.tree import find_groups
 from gift_peft.dataset.writer import write_card, write_rows
 from gift_peft.files import write_whole
+from gift_peft.options import package_version
 from gift_peft.prepare.entries import Statistics
 from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import FORMAT, Job, Outcome
@@ -252,10 +253,10 @@ def _report(raw: Path, out: Path, settings: PrepareSettings, entries: list[dict]
         "raw": Path(os.path.relpath(raw.resolve(), out.resolve())).as_posix(),
         "settings": asdict(settings),
         "versions": {
-            "gift-peft": version("gift-peft"),
+            "gift-peft": package_version("gift-peft"),
             "opencv": cv2.__version__,
             "numpy": np.__version__,
-            "pillow": version("pillow"),
+            "pillow": PIL.__version__,
             "python": platform.python_version(),
         },
         "removed": removed,

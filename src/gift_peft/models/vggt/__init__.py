@@ -3,7 +3,7 @@
 Saved folders carry these files, so that they also load with `trust_remote_code=True` where gift-peft is not installed.
 """
 
-from gift_peft.models import register_classes
+from gift_peft.models.auto_classes import register_classes
 
 from .configuration_vggt import VggtConfig
 from .image_processing_vggt import VggtImageProcessorPil

@@ -39,7 +39,9 @@ def _parser() -> argparse.ArgumentParser:
         epilog="example: gift-peft demo --out demo; `gift-peft VERB --help` has an example of each verb",
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action=_Version, help="print the versions of gift-peft and what it stands on")
+    parser.add_argument(
+        "-V", "--version", action=_Version, help="print the versions of gift-peft and what it stands on"
+    )
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for verb, (_, text) in VERBS.items():
         verbs.add_parser(verb, help=text, add_help=False)

@@ -20,6 +20,7 @@ from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.prepare import synthesize
 from gift_peft.prepare.prepare import prepare_gift_i
 from gift_peft.prepare.synthesize import synthesize_groups
+from gift_peft.surface_targets import paint_fills
 from gift_peft.training import train
 
 SIZE = (60, 80)
@@ -273,11 +274,7 @@ def break_photo(flat, what):
             "empty": np.zeros(SIZE, bool),
             "whole": np.ones(SIZE, bool),
             "size": np.ones((30, 40), bool),
-            "tiny": np.zeros((600, 800), bool),
         }
-        if what == "tiny":  # one pixel, where paint fades in over six
-            Image.fromarray(np.full((600, 800, 3), 90, np.uint8)).save(flat / "img_0.jpg")
-            masks["tiny"][300, 400] = True
         write_mask(flat, "img_0", masks[what])
 
 
@@ -301,9 +298,15 @@ def test_a_bad_photo_is_named_and_the_others_are_made(what, words, flat, tmp_pat
     assert load_gift_i(tmp_path / "out", "train")["group_id"][:] == ["img_1", "img_2"]
 
 
-def test_a_target_too_small_to_paint(flat, tmp_path):
-    break_photo(flat, "tiny")
-    report = synthesize_groups(flat, tmp_path / "out", fills=200)
+def test_a_target_too_small_to_paint(flat, tmp_path, monkeypatch):
+    def weak(image, mask, count, seed):  # as paint is on a pixel or two of a large photo
+        return paint_fills(image, mask, count, seed) if mask.sum() > 1 else [image] * count
+
+    monkeypatch.setattr(synthesize, "paint_fills", weak)
+    one = np.zeros(SIZE, bool)
+    one[30, 40] = True
+    write_mask(flat, "img_0", one)
+    report = synthesize_groups(flat, tmp_path / "out")
     assert "so small that painted copies do not differ (1 pixels)" in report.rejected["img_0.jpg"]
     assert report.groups == ["img_1", "img_2"]
 

@@ -21,7 +21,7 @@ def main() -> None:
     args = parser.parse_args()
 
     # The adapter names its base, and its folder brings the image processor with the size it was trained at.
-    estimate = pipeline("depth-estimation", model=args.adapter)
+    estimate = pipeline("depth-estimation", model=args.adapter, image_processor=args.adapter)
     show("pipeline", estimate(args.image)["predicted_depth"].numpy())
 
     # The same as float32 numpy, with the base beside it.

@@ -135,3 +135,11 @@ def test_tests_mirror_the_package():
     """Every folder of tests is one of the package's, or holds what tests need."""
     folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir() and not path.name.startswith("__")}
     assert folders <= {path.name for path in PACKAGE.iterdir() if path.is_dir()} | {"helpers", "fixtures", "examples"}
+
+
+def test_the_page_of_the_architecture_has_these_floors():
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    block = text.split("## Floors")[1].split("```")[1]
+    there = {name.split(".")[1] for name in FILES if name not in DOORWAY}
+    floors = [floor & there for floor in FLOORS]
+    assert [set(line.split(", ")) for line in block.strip().splitlines()] == list(filter(None, floors))

@@ -141,8 +141,8 @@ def test_signals_checkpoint_after_the_group_and_say_how_to_go_on(
 @pytest.mark.parametrize("number", [1, 2, 3])  # of the base, after each epoch
 def test_a_signal_in_the_middle_of_a_validation_stops_it(number, args, whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        # A validation of two groups reads the first one, to see what they are, and then both.
-        stop = on_call(3 * number - 1, operator.getitem, lambda *a: os.kill(os.getpid(), signal.SIGTERM))
+        # A validation reads two groups: a signal at the first stops it before the second.
+        stop = on_call(2 * number - 1, operator.getitem, lambda *a: os.kill(os.getpid(), signal.SIGTERM))
         until = validation.UntilStopped
         patch.setattr(validation, "UntilStopped", lambda groups, *signals: until(Stopping(groups, stop), *signals))
         result = train(args)

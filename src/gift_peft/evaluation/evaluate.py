@@ -364,7 +364,8 @@ def _on_one_grid(
     depths: list[torch.Tensor], masks: list[np.ndarray], valids: list[np.ndarray | None]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
     """Predictions, target and valid masks of a group (N,h,w), at the size of the first prediction."""
-    shape = tuple(depths[0].shape)
+    height, width = depths[0].shape
+    shape = height, width
     depth = torch.stack(
         [d if d.shape == shape else torch.from_numpy(resize_prediction(d, shape)).float() for d in depths]
     )

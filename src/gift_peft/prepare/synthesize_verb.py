@@ -8,8 +8,9 @@ from gift_peft.options import OptionParser, number
 
 DESCRIPTION = """Groups for training from single photos: each photo, and copies with a target of one plain color.
 
-Exit code: 0 if every photo is in OUT, 3 if some were rejected, 1 if none could be painted, 2 for a wrong command line.
-Run again, it does what is left to do. What is known about such groups, and what is not: docs/capture.md."""
+Groups with a treated reference or in validation/ are skipped. Exit code: 0 if all other photos are in OUT, 3 if some
+were rejected, 1 if none could be painted, 2 for a wrong command line. Run again, it does what is left to do.
+What is known about such groups, and what is not: docs/capture.md."""
 
 
 def make_parser() -> OptionParser:

@@ -36,6 +36,8 @@ class GroupPictures:
         surface (`str`, *optional*): "mirror" or "transparent".
         proxies (`torch.Tensor`, *optional*): (N, h, w) float32 in native units, if a teacher was named.
         reference_proxy (`torch.Tensor`, *optional*): (h, w) float32, the teacher's prediction on the reference.
+        surface_target, surface_target_flipped (`torch.Tensor`, *optional*): (N, h, w) float32, if asked for: where
+            the surface is, and where it is in the flipped photos.
 
     Raises ValueError, naming the group and the part, unless there is one of each for every name, all of one size.
     """
@@ -50,6 +52,8 @@ class GroupPictures:
     surface: str | None = None
     proxies: torch.Tensor | None = None
     reference_proxy: torch.Tensor | None = None
+    surface_target: torch.Tensor | None = None
+    surface_target_flipped: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         pictures = [image.size[::-1] for image in self.images]
@@ -112,14 +116,28 @@ def parse_group(
         SURFACES[surface] if isinstance(surface, int) else surface,  # of a row, the number of its label
         record.get("proxies"),
         record.get("reference_proxy"),
+        record.get("surface_target"),
+        record.get("surface_target_flipped"),
     )
 
 
 def check_count(group_id: str, count: int, split: str, has_reference: bool) -> None:
-    """A group takes two observations to compare; in validation one will do if there is a treated reference."""
-    if count < (1 if split == "validation" and has_reference else 2):
-        hint = "" if split == "train" else ", or one and a treated reference"
-        raise ValueError(f"group {group_id} has {count} different image{'s' * (count != 1)}; it takes two{hint}")
+    """A validation group takes two observations to compare, or one and a treated reference; a train group only one.
+
+    What compares the observations of a train group asks for two itself: `check_pair`.
+    """
+    if count < (1 if split == "train" or has_reference else 2):
+        hint = " at least one" if split == "train" else " two, or one and a treated reference"
+        raise ValueError(f"group {group_id} has {count} different image{'s' * (count != 1)}; it takes{hint}")
+
+
+def check_pair(group_id: str, count: int) -> None:
+    """Raise ValueError for a group of one, where observations are to be compared."""
+    if count < 2:
+        raise ValueError(
+            f"group {group_id} has {count} different image{'s' * (count != 1)}; it takes two to compare; "
+            "a single photo trains as it is with --target surface"
+        )
 
 
 def check_group_id(group_id: str) -> None:

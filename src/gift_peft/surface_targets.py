@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     Array = np.ndarray | torch.Tensor
 
+RULE = "surface 1"  # changes with whatever changes a target or a fill: stored targets of another rule are refused
 MODELS = ("auto", "plane", "quantile")
 KINDS = ("depth", "inverse_depth")
 SURFACES = (None, "mirror", "transparent")
@@ -31,6 +32,7 @@ OUTLIER = 5  # times the median distance from the group: something else is there
 SMOOTHING = 1e-4  # of the component's spread: residuals below it count as none
 CONVERGED = 1e-6  # of the component's spread: a plane that moves less has been found
 MAX_ROUNDS = 200
+SAMPLE = 2**14  # pixels that a fit begins with
 EDGE = 0.01  # of the shorter side: where paint fades in
 GREY, TINT = 0.6, 0.3  # a fill's grey and what each channel adds to it, at most, of full brightness
 PLANE_RATIO = 1.0  # "auto" takes the plane where it misses the nearer observations by less than this disagreement
@@ -278,16 +280,19 @@ def _plane(
 
 def _pinball(design: np.ndarray, y: np.ndarray, tau: float) -> np.ndarray:
     """(K,) weights of the K rows of `design` that minimise sum rho_tau(y - weights @ design); y has spread 1."""
-    solution, weights = np.zeros(len(design)), np.ones_like(y)
-    for _ in range(MAX_ROUNDS):
+    solution, weights, step = np.zeros(len(design)), np.ones_like(y), len(y) // SAMPLE
+    if step > 1:  # begin where every `step`-th pixel leads: few rounds are left for all of them
+        solution = _pinball(design[:, ::step], y[::step], tau)
+    for number in range(MAX_ROUNDS):
+        if number or step > 1:
+            residual = y - solution @ design
+            weights = np.where(residual > 0, tau, 1 - tau) / np.maximum(np.abs(residual), SMOOTHING)
         weighted = design * weights
         new = np.linalg.lstsq(weighted @ design.T, weighted @ y, rcond=None)[0]
         moved = np.abs(new - solution).sum()  # bounds the change at every pixel: the design is at most about 1
         solution = new
         if moved < CONVERGED:
             break
-        residual = y - solution @ design
-        weights = np.where(residual > 0, tau, 1 - tau) / np.maximum(np.abs(residual), SMOOTHING)
     return solution
 
 
@@ -296,6 +301,7 @@ def _scale_and_shift(values: np.ndarray, common: np.ndarray) -> tuple[np.ndarray
     scale, shift, pixels = np.ones(len(values)), np.zeros(len(values)), values[:, common]
     if len(values) < 2 or pixels.shape[1] < MIN_COMMON:
         return scale, shift
+    pixels = pixels[:, :: max(1, pixels.shape[1] // SAMPLE)]  # so many say a scale and a shift as well as all
     middle = np.median(pixels, axis=1)
     size = np.median(np.abs(pixels - middle[:, None]), axis=1)
     if not (size > 0).all():

@@ -8,6 +8,7 @@ from helpers.runs import arguments, rows_of, train_again
 from helpers.tiny import write_group, write_raw_tree
 from safetensors import SafetensorError
 
+from gift_peft.group_step import GroupStep
 from gift_peft.training import checkpoints, loop, start, train
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
@@ -53,9 +54,9 @@ def test_nan_stops_with_the_groups_name_and_leaves_the_last_checkpoint(base_dir,
             return accumulate(step, *values)
         return output
 
-    accumulate = loop.GroupStep.accumulate
+    accumulate = GroupStep.accumulate
     with monkeypatch.context() as patch:
-        patch.setattr(loop.GroupStep, "accumulate", explode)
+        patch.setattr(GroupStep, "accumulate", explode)
         with pytest.raises(ValueError, match=r"step 2, group scene_\d: .*(NaN|non-finite).*checkpoint-1") as error:
             train(args)
     assert "\n" not in str(error.value)
@@ -96,7 +97,7 @@ def test_a_loss_that_overflows_is_an_error():
     """The gradient of an L1 is a sign: it stays finite."""
     model = torch.nn.Conv2d(3, 1, 1, bias=False)
     torch.nn.init.constant_(model.weight, 3e38)
-    step = loop.GroupStep(one_conv(model))
+    step = GroupStep(one_conv(model))
     pixels = torch.zeros(2, 3, 4, 4)
     pixels[0, 0], pixels[1, 0] = 1, -1
     with pytest.raises(ValueError, match="loss of this group is NaN or infinite"):

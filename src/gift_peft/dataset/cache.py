@@ -19,14 +19,14 @@ import safetensors
 import safetensors.numpy
 import safetensors.torch
 
-from gift_peft.dataset.proxies import METADATA, picture_digests
+from gift_peft.dataset.proxies import METADATA, mask_digests, picture_digests
 from gift_peft.dataset.rows import FORMAT_TYPE, RowRules
 from gift_peft.dataset.tensors import Group, resize_pictures, to_group
 from gift_peft.files import write_whole
 from gift_peft.models.pixels import pixel_settings
 from gift_peft.rules import SURFACES
 
-FORMAT = "gift-peft group 1"
+FORMAT = "gift-peft group 2"
 PICTURES = ("images", "masks", "valids")
 
 logger = logging.getLogger(__name__)
@@ -53,26 +53,37 @@ class GroupCache:
         self.size = size
         self.folder = folder
         rules = dataset.format["format_kwargs"].get("rules") or RowRules()
-        self._train, self._proxies = rules.train, rules.proxies
+        self._train, self._proxies, self._surface = rules.train, rules.proxies, rules.surface
         self._groups = dataset.with_format(FORMAT_TYPE, rules=RowRules(rules.train, parsed=True))
         self._stored = dataset.with_format("arrow")
         self._checked: dict[int, Path] = {}  # the entries that were found whole in this run
 
-    def read(self, index: int) -> Group:
-        """The group of one row, without its `pictures`. Raises as reading the row and `collate_group` do."""
+    def read(self, index: int, image: int | None = None) -> Group:
+        """The group of one row, without its `pictures`; or one image of it, with its surface targets alone.
+
+        Raises as reading the row and `collate_group` do.
+        """
         path = self._checked.get(index) or self._path(index)
         found = None if path is None else self._load(path, check=index not in self._checked)
         if found is None:
             pictures = self._groups[index]
-            arrays, digests = resize_pictures(pictures, self.processor, self.size), picture_digests(pictures)
+            arrays = resize_pictures(pictures, self.processor, self.size)
+            digests = picture_digests(pictures) | mask_digests(pictures)
             if path is not None:
                 self._write(path, arrays, digests)
         else:
             self._checked[index] = path
             arrays, digests = found
         group_id, names, surface = self._facts(index)
-        proxies = (None, None) if self._proxies is None else self._proxies.read(group_id, names, digests)
-        return to_group(group_id, names, surface, arrays, proxies, self.processor, self.size)
+        proxies, targets, part = (None, None), (None, None), slice(None)
+        if image is not None:  # the arrays are mapped into memory: only this image's pages are read
+            part = slice(image, image + 1)
+            arrays = {name: arrays[name][part] for name in PICTURES if name in arrays}
+        elif self._proxies is not None:
+            proxies = self._proxies.read(group_id, names, digests)
+        if self._surface is not None:
+            targets = self._surface.read(group_id, names, digests, part)
+        return to_group(group_id, names[part], surface, arrays, proxies, self.processor, self.size, targets)
 
     def _facts(self, index: int) -> tuple[str, list[str], str | None]:
         """(group id, image names, surface) of a row, whose pictures stay as they are stored."""

@@ -10,7 +10,8 @@ import os
 import re
 import shlex
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import datasets
@@ -24,7 +25,7 @@ from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
 from gift_peft.captures.tree import list_groups, raw_example
-from gift_peft.dataset.proxies import FORMAT, ProxyStore, default_proxies_dir
+from gift_peft.dataset.proxies import FORMAT, ProxyStore, SurfaceSettings, SurfaceStore, default_proxies_dir
 from gift_peft.dataset.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
 from gift_peft.files import is_hub_id, reason
 from gift_peft.images import image_digest, natural_key
@@ -115,6 +116,7 @@ def load_gift_i(
     revision: str | None = None,
     size: tuple[int, int] | None = None,
     dataset_revision: str | None = None,
+    surface: SurfaceSettings | None = None,
 ) -> datasets.Dataset:
     """GIFT-I groups, checked, as a `datasets.Dataset` with `FEATURES`; with a teacher also their proxies.
 
@@ -132,6 +134,8 @@ def load_gift_i(
         revision (`str`, *optional*): of the teacher.
         size (`tuple[int, int]`, *optional*): (h, w) that the proxies must have.
         dataset_revision (`str`, *optional*): of a hub dataset.
+        surface (`SurfaceSettings`, *optional*): with a teacher, attaches the surface targets made with these settings:
+            accessed rows also have `surface_target` and `surface_target_flipped` (N, h, w), float32 tensors.
 
     Raises:
         FileNotFoundError, ValueError: one line that names the file or group and says what to do.
@@ -139,20 +143,26 @@ def load_gift_i(
     dataset = _load_rows(path, split, dataset_revision)
     name = re.match(r"\w*", str(split)).group()
     dataset = _check_rows(dataset, name, path)
-    store = None
+    rules = RowRules(train=name == "train")
     if teacher is not None:
         identity = teacher_id(teacher, revision)
         proxies = Path(proxies_dir) if proxies_dir else default_proxies_dir(path, identity)
         expected = {"format": FORMAT, "teacher": identity, "revision": teacher_revision(teacher, revision)}
         if size is not None:
             expected["size"] = f"{size[0]}x{size[1]}"
-        command = proxies_command(teacher, path, expected.get("size"), proxies_dir, revision)
-        store = ProxyStore(str(proxies / identity / name), expected, command)
-    return dataset.with_format(FORMAT_TYPE, rules=RowRules(train=name == "train", proxies=store))
+        folder = str(proxies / identity / name)
+        command = partial(proxies_command, teacher, path, expected.get("size"), proxies_dir, revision)
+        rules = replace(rules, proxies=ProxyStore(folder, expected, command()))
+        if surface is not None:
+            store = SurfaceStore(folder, expected | surface.header(), command(surface))
+            rules = replace(rules, surface=store)
+    return dataset.with_format(FORMAT_TYPE, rules=rules)
 
 
-def proxies_command(teacher, path, size=None, proxies_dir=None, revision=None) -> str:
-    """The shell command that makes these proxies."""
+def proxies_command(
+    teacher, path, size=None, proxies_dir=None, revision=None, surface: SurfaceSettings | None = None
+) -> str:
+    """The shell command that makes these proxies, or surface targets."""
     options = {
         "--base": teacher,
         "--dataset": path,
@@ -160,6 +170,11 @@ def proxies_command(teacher, path, size=None, proxies_dir=None, revision=None) -
         "--proxies_dir": proxies_dir,
         "--revision": revision,
     }
+    if surface is not None:
+        options["--target"] = "surface"
+        for field in fields(surface):
+            value = getattr(surface, field.name)
+            options[f"--{field.name}"] = None if value == field.default else value
     given = [part for option, value in options.items() if value is not None for part in (option, str(value))]
     return shlex.join(["gift-peft", "proxies", *given])
 

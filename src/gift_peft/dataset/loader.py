@@ -6,9 +6,10 @@ interpreter lock), so that the step does not wait.
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -16,11 +17,18 @@ import torch
 from gift_peft.dataset.cache import GroupCache
 from gift_peft.dataset.tensors import Group
 
+Item = TypeVar("Item")
+
 
 def epoch_order(num_groups: int, seed: int, epoch: int) -> list[int]:
     """A permutation of the groups that depends on its arguments alone."""
     state = int(np.random.SeedSequence((seed, epoch)).generate_state(1, np.uint64)[0])
     return torch.randperm(num_groups, generator=torch.Generator().manual_seed(state)).tolist()
+
+
+def epoch_flips(num_images: int, seed: int, epoch: int) -> list[bool]:
+    """Which images of an epoch are shown as in a mirror, one in two; depends on its arguments alone."""
+    return np.random.default_rng((seed, epoch)).integers(2, size=num_images).astype(bool).tolist()
 
 
 class PreparedGroups:
@@ -45,26 +53,72 @@ class PreparedGroups:
 
     def __getitem__(self, index: int) -> Group:
         """Errors of `GroupCache.read`; ValueError if the row has no proxies."""
-        group = self._cache.read(index)
+        group = self.read(index)
         if group.target is None:
             raise ValueError(f"group {group.group_id} has no proxies")
+        return group
+
+    def read(self, index: int, image: int | None = None) -> Group:
+        """`GroupCache.read`: a group, or one image of it."""
+        group = self._cache.read(index, image)
         if torch.cuda.is_available():  # a pinned tensor travels while the device computes
             group.pixel_values = group.pixel_values.pin_memory()
         return group
 
     def take(self, indices: Iterable[int]) -> Iterator[Group]:
         """The groups of these indices, in this order; there may be infinitely many."""
-        if self.num_threads == 0:
-            yield from (self[index] for index in indices)
-            return
-        pool = ThreadPoolExecutor(self.num_threads, thread_name_prefix="groups")
-        ahead: deque = deque()
-        try:
-            for index in indices:
-                ahead.append(pool.submit(self.__getitem__, index))
-                if len(ahead) > self.num_threads:
-                    yield ahead.popleft().result()
-            while ahead:
+        return read_ahead(self.__getitem__, indices, self.num_threads)
+
+
+class PreparedImages:
+    """The images of groups, one by one: groups of one, with their surface targets. Their groups are not kept.
+
+    Args:
+        groups: of rows with surface targets, as `load_gift_i(..., teacher=..., surface=...)` gives them.
+    """
+
+    def __init__(self, groups: PreparedGroups) -> None:
+        self.groups = groups
+        counts = map(len, groups.dataset["image_names"])
+        self._places = [(row, image) for row, count in enumerate(counts) for image in range(count)]
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def read(self, index: int, flip: bool = False) -> Group:
+        """One image, called `<group>/<image>`, or its mirror image; `surface_target` is that of what is shown.
+
+        Errors of `GroupCache.read`; ValueError if the row has no surface targets.
+        """
+        image = self.groups.read(*self._places[index])
+        if image.surface_target is None:
+            raise ValueError(f"group {image.group_id} has no surface targets")
+        image.names = [f"{image.group_id}/{name}" for name in image.names]
+        if flip:
+            image.pixel_values, image.mask = image.pixel_values.flip(-1), image.mask.flip(-1)
+            image.valid = None if image.valid is None else image.valid.flip(-1)
+            image.surface_target = image.surface_target_flipped
+        image.surface_target_flipped = None
+        return image
+
+    def take(self, items: Iterable[tuple[int, bool]]) -> Iterator[Group]:
+        """`read` of these (index, flip), in this order; there may be infinitely many."""
+        return read_ahead(lambda item: self.read(*item), items, self.groups.num_threads)
+
+
+def read_ahead(read: Callable[[Item], Group], items: Iterable[Item], num_threads: int) -> Iterator[Group]:
+    """`read(item)` of each item, in their order, so many of them prepared before they are asked for."""
+    if num_threads == 0:
+        yield from map(read, items)
+        return
+    pool = ThreadPoolExecutor(num_threads, thread_name_prefix="groups")
+    ahead: deque = deque()
+    try:
+        for item in items:
+            ahead.append(pool.submit(read, item))
+            if len(ahead) > num_threads:
                 yield ahead.popleft().result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        while ahead:
+            yield ahead.popleft().result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)

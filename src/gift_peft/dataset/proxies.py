@@ -3,6 +3,9 @@
 `proxies/<teacher>/<split>/<group_id>.safetensors` holds `proxies` (N, h, w) float32 in image order and, where the
 group has a treated reference, `reference` (h, w). The header names the teacher, its revision, the size, the image
 processor's settings and a digest of every image's decoded content: a proxy of other weights or pixels is never used.
+
+`<group_id>.surface.safetensors` beside it holds the surface targets, `target` and `target_flipped` (N, h, w) float32,
+the second in the orientation of the flipped photo. Its header states that besides the masks and how it was made.
 """
 
 from __future__ import annotations
@@ -11,21 +14,64 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import safetensors
 
 from gift_peft.files import reason, write_whole
 from gift_peft.images import image_digest
 from gift_peft.rules import GroupPictures
+from gift_peft.surface_targets import MODELS, RULE
 
 if TYPE_CHECKING:
     import torch
 
 FORMAT = "gift-peft proxies 1"
+SURFACE_FORMAT = "gift-peft surface targets 1"
 METADATA = "gift_peft"
+SURFACE_SUFFIX = ".surface"
+# What a header says apart from pixels, in the order in which differences are told, and in words where those differ.
+STATED = ("format", "teacher", "revision", "size", "processor", "kind", "rule")
+STATED += ("fills", "seed", "surface_model", "surface_quantile", "surface_tau")
+IN_WORDS = {"revision": "model or revision", "processor": "image processor"}
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """How surface targets are made; a file's header states every value.
+
+    Args:
+        fills (`int`): copies of each photo with its target painted, predicted beside it; 0 is allowed.
+        seed (`int`): of the fills' colors.
+        surface_model (`str`): "auto", "plane" or "quantile", as `surface_target` takes it.
+        surface_quantile, surface_tau (`float`): levels of the two models; higher is nearer.
+
+    Raises:
+        ValueError: a value out of range.
+    """
+
+    fills: int = 6
+    seed: int = 0
+    surface_model: str = "auto"
+    surface_quantile: float = 0.8
+    surface_tau: float = 0.7
+
+    def __post_init__(self) -> None:
+        if self.fills < 0 or self.seed < 0:
+            raise ValueError(f"fills and seed: must not be negative, got {self.fills} and {self.seed}")
+        if self.surface_model not in MODELS:
+            raise ValueError(f"surface_model {self.surface_model!r}: it is one of {', '.join(MODELS)}")
+        if not 0 <= self.surface_quantile <= 1:
+            raise ValueError(f"surface_quantile: must lie from 0 to 1, got {self.surface_quantile}")
+        if not 0 < self.surface_tau < 1:
+            raise ValueError(f"surface_tau: must lie between 0 and 1, got {self.surface_tau}")
+
+    def header(self) -> dict:
+        """What a file's header states about how it was made."""
+        return {"format": SURFACE_FORMAT, "rule": RULE, **asdict(self)}
 
 
 def default_proxies_dir(dataset: str | Path, teacher: str) -> Path:
@@ -48,11 +94,18 @@ def default_proxies_dir(dataset: str | Path, teacher: str) -> Path:
 
 def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: torch.Tensor | None) -> None:
     """Write one file, whole or not at all."""
+    _write(path, header, {"proxies": proxies} | ({} if reference is None else {"reference": reference}))
+
+
+def write_surface(path: Path, header: dict, target: torch.Tensor, target_flipped: torch.Tensor) -> None:
+    """Write the surface targets of a group, whole or not at all."""
+    _write(path, header, {"target": target, "target_flipped": target_flipped})
+
+
+def _write(path: Path, header: dict, tensors: dict[str, torch.Tensor]) -> None:
     import safetensors.torch
 
-    tensors = {"proxies": proxies.float().contiguous()}
-    if reference is not None:
-        tensors["reference"] = reference.float().contiguous()
+    tensors = {name: tensor.float().contiguous() for name, tensor in tensors.items()}
     # One entry, because safetensors writes several in random order, and equal proxies shall be equal files.
     write_whole(path, safetensors.torch.save(tensors, metadata={METADATA: json.dumps(header, sort_keys=True)}))
 
@@ -76,32 +129,48 @@ def picture_digests(group: GroupPictures) -> dict:
     }
 
 
-def read_header(path: Path, command: str = "gift-peft proxies") -> dict:
+def mask_digests(group: GroupPictures) -> dict:
+    """The part of a surface target's header that pins one group's masks, and the pixels that exist."""
+    parts = {"masks": group.masks, "valids": group.valids}
+    return {name: [_mask_digest(mask) for mask in masks] for name, masks in parts.items()}
+
+
+def _mask_digest(mask: np.ndarray) -> str:
+    digest = hashlib.blake2b(f"{mask.shape} ".encode(), digest_size=16)
+    digest.update(np.packbits(mask).tobytes())
+    return digest.hexdigest()
+
+
+def read_header(path: Path, command: str = "gift-peft proxies", what: str = "proxy") -> dict:
     """The header of a proxy file, empty if it is not one of ours; ValueError if the file is damaged.
 
-    `command` makes these proxies, for the message.
+    For the message, `command` makes it, and it is called `what`.
     """
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             return json.loads((file.metadata() or {}).get(METADATA, "{}"))
     except (safetensors.SafetensorError, json.JSONDecodeError) as error:
         raise ValueError(
-            f"damaged proxy {path} ({reason(error)}); make it again with `{command} --overwrite`"
+            f"damaged {what} {path} ({reason(error)}); make it again with `{command} --overwrite`"
         ) from None
 
 
 def difference(header: dict, expected: dict, names: Sequence[str]) -> str | None:
-    """In words, the first way in which a proxy's header is not the expected one; None if it is."""
-    for key in ("format", "teacher", "revision", "size", "processor"):
+    """In words, the first way in which a header is not the expected one; None if it is."""
+    for key in STATED:
         if key in expected and header.get(key) != expected[key]:
-            what = {"revision": "model or revision", "processor": "image processor"}.get(key, key)
-            return f"it was made with {what} {header.get(key)}, not {expected[key]}"
+            return f"it was made with {IN_WORDS.get(key, key)} {header.get(key)}, not {expected[key]}"
     made, now = header.get("images", []), expected["images"]
     if len(made) != len(now):
         return f"it was made for {len(made)} images, and the group has {len(now)}"
-    for name, before, after in zip(names, made, now, strict=True):
-        if before != after:
-            return f"image {name} has changed since"
+    for what, part in (("image", "images"), ("the mask of", "masks"), ("the valid mask of", "valids")):
+        if part not in expected or part not in header:
+            continue
+        if len(header[part]) != len(expected[part]):
+            return "the valid masks have changed since"
+        for name, before, after in zip(names, header[part], expected[part], strict=False):
+            if before != after:
+                return f"{what} {name} has changed since"
     if header.get("reference") != expected["reference"]:
         return "the treated reference has changed since"
     return None
@@ -127,22 +196,56 @@ class ProxyStore:
         Raises FileNotFoundError for a missing file and ValueError for a stale, damaged or NaN one, naming it and the
         command that makes it again.
         """
-        import safetensors.torch
+        tensors = self._read(f"{group_id}.safetensors", "proxy", ("proxies",), names, digests)
+        return tensors["proxies"], tensors.get("reference")
 
-        path = Path(self.folder) / f"{group_id}.safetensors"
+    def _read(
+        self,
+        file: str,
+        what: str,
+        columns: tuple[str, ...],
+        names: Sequence[str],
+        digests: dict,
+        part: slice = slice(None),
+    ) -> dict[str, torch.Tensor]:
+        """The tensors of a file, checked; of the columns, which have an entry per image, only this part."""
+        path = Path(self.folder) / file
         if not path.exists():
-            raise FileNotFoundError(f"missing proxy {path}; make it with `{self.command}`")
-        header, tensors = read_header(path, self.command), safetensors.torch.load_file(path)
-        proxies, reference = tensors.get("proxies"), tensors.get("reference")
-        again = f"make it again with `{self.command} --overwrite`"
-        if proxies is None:
-            raise ValueError(f"damaged proxy {path} (not a proxy file); {again}")
-        made = len(header.get("images", proxies))
-        if len(proxies) != made:
-            raise ValueError(f"damaged proxy {path} (it holds {len(proxies)} of {made} proxies); {again}")
-        for name, proxy in [*zip(names, proxies, strict=False), ("reference", reference)]:
-            if proxy is not None and not proxy.isfinite().all():
-                raise ValueError(f"NaN or infinite values in proxy {path} ({name}); {again}")
+            raise FileNotFoundError(f"missing {what} {path}; make it with `{self.command}`")
+        header, again = read_header(path, self.command, what), f"make it again with `{self.command} --overwrite`"
+        with safetensors.safe_open(path, framework="pt") as opened:
+            stored = set(opened.keys())
+            if not stored.issuperset(columns):
+                raise ValueError(f"damaged {what} {path} (not a {what} file); {again}")
+            tensors = {name: opened.get_tensor(name) for name in stored.difference(columns)}
+            for name in columns:
+                count, *_ = opened.get_slice(name).get_shape()
+                if count != (made := len(header.get("images", range(count)))):
+                    many = "proxies" if what == "proxy" else f"{what}s"
+                    raise ValueError(f"damaged {what} {path} (it holds {count} of {made} {many}); {again}")
+                tensors[name] = opened.get_slice(name)[part]
+        for name, tensor in tensors.items():
+            labels = names[part] if name in columns else [name]
+            for label, values in zip(labels, tensor if name in columns else [tensor], strict=False):
+                if not values.isfinite().all():
+                    raise ValueError(f"NaN or infinite values in {what} {path} ({label}); {again}")
         if changed := difference(header, {**self.expected, **digests}, names):
-            raise ValueError(f"stale proxy {path}: {changed}; {again}")
-        return proxies, reference
+            raise ValueError(f"stale {what} {path}: {changed}; {again}")
+        return tensors
+
+
+@dataclass(frozen=True)
+class SurfaceStore(ProxyStore):
+    """Likewise the surface targets; `expected` holds the entries of `SurfaceSettings.header` besides."""
+
+    def read(
+        self, group_id: str, names: Sequence[str], digests: dict, part: slice = slice(None)
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """(target, target_flipped), each (N, h, w) float32 or of the images in `part`; `mask_digests` count too.
+
+        Raises as `ProxyStore.read`.
+        """
+        columns = ("target", "target_flipped")
+        file = f"{group_id}{SURFACE_SUFFIX}.safetensors"
+        tensors = self._read(file, "surface target", columns, names, digests, part)
+        return tensors["target"], tensors["target_flipped"]

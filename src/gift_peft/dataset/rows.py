@@ -15,7 +15,7 @@ from datasets import formatting
 from datasets.formatting.formatting import Formatter
 from PIL import Image
 
-from gift_peft.dataset.proxies import ProxyStore, picture_digests
+from gift_peft.dataset.proxies import ProxyStore, SurfaceStore, mask_digests, picture_digests
 from gift_peft.images import open_image, to_mask, to_rgb
 from gift_peft.rules import GroupPictures, parse_group
 
@@ -30,11 +30,13 @@ class RowRules:
     Args:
         train (`bool`): some mask of a group must have a target.
         proxies (`ProxyStore`, *optional*): adds `proxies` and `reference_proxy`.
+        surface (`SurfaceStore`, *optional*): adds `surface_target` and `surface_target_flipped`.
         parsed (`bool`): a row is a `GroupPictures` in place of a dict.
     """
 
     train: bool = False
     proxies: ProxyStore | None = None
+    surface: SurfaceStore | None = None
     parsed: bool = False
 
 
@@ -77,6 +79,9 @@ class GiftIFormatter(Formatter):
                 return group
             if self.rules.proxies is not None:
                 row["proxies"], row["reference_proxy"] = group.proxies, group.reference_proxy
+            if self.rules.surface is not None:
+                row["surface_target"] = group.surface_target
+                row["surface_target_flipped"] = group.surface_target_flipped
         return {key: row[key] for key in [*stored, *(key for key in row if key not in stored)]}
 
     def _picture(self, column: str, item: dict, at: str) -> Image.Image:
@@ -94,10 +99,16 @@ class GiftIFormatter(Formatter):
         group = parse_group(row)
         if self.rules.train:
             group.check_target()
-        if self.rules.proxies is None:
-            return group
-        proxies, reference = self.rules.proxies.read(group.group_id, group.names, picture_digests(group))
-        return replace(group, proxies=proxies, reference_proxy=reference)
+        found, pixels = {}, {}
+        if self.rules.proxies is not None:
+            pixels = picture_digests(group)
+            proxies, reference = self.rules.proxies.read(group.group_id, group.names, pixels)
+            found = {"proxies": proxies, "reference_proxy": reference}
+        if self.rules.surface is not None:
+            pixels |= mask_digests(group)
+            target, flipped = self.rules.surface.read(group.group_id, group.names, pixels)
+            found |= {"surface_target": target, "surface_target_flipped": flipped}
+        return replace(group, **found) if found else group
 
 
 def _open(item: dict, fallback: str) -> tuple[Image.Image, str]:

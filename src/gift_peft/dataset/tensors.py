@@ -29,6 +29,9 @@ class Group:
         reference_pixel_values (`torch.Tensor`, *optional*): (1, 3, h, w) float32, the treated reference.
         reference_target (`torch.Tensor`, *optional*): (h, w) float32, the teacher's prediction on it.
         surface (`str`, *optional*): "mirror" or "transparent".
+        surface_target, surface_target_flipped (`torch.Tensor`, *optional*): (N, h, w) float32 in native units: inside
+            the mask where the surface is, outside the proxies; of the photos and, in their orientation, of the
+            flipped photos.
         pictures (`GroupPictures`, *optional*): the same at the original size; None if they were not decoded now.
     """
 
@@ -41,6 +44,8 @@ class Group:
     reference_pixel_values: torch.Tensor | None = None
     reference_target: torch.Tensor | None = None
     surface: str | None = None
+    surface_target: torch.Tensor | None = None
+    surface_target_flipped: torch.Tensor | None = None
     pictures: GroupPictures | None = None
 
 
@@ -53,7 +58,9 @@ def collate_group(row: dict | GroupPictures, processor, size: tuple[int, int]) -
     pictures = parse_group(row)
     arrays = resize_pictures(pictures, processor, size)
     proxies = pictures.proxies, pictures.reference_proxy
-    group = to_group(pictures.group_id, pictures.names, pictures.surface, arrays, proxies, processor, size)
+    targets = pictures.surface_target, pictures.surface_target_flipped
+    facts = pictures.group_id, pictures.names, pictures.surface
+    group = to_group(*facts, arrays, proxies, processor, size, targets)
     group.pictures = pictures
     return group
 
@@ -73,12 +80,23 @@ def resize_pictures(pictures: GroupPictures, processor, size: tuple[int, int]) -
 
 
 def to_group(
-    group_id: str, names: Sequence[str], surface: str | None, arrays: dict[str, np.ndarray], proxies, processor, size
+    group_id: str,
+    names: Sequence[str],
+    surface: str | None,
+    arrays: dict[str, np.ndarray],
+    proxies,
+    processor,
+    size,
+    targets=(None, None),
 ) -> Group:
-    """A `Group` of the arrays of `resize_pictures` and (proxies, reference proxy); ValueError if those differ."""
+    """A `Group` of the arrays of `resize_pictures`, (proxies, reference proxy) and the two surface targets.
+
+    Raises ValueError for proxies or targets of another size.
+    """
     import torch
 
     target, reference_target = (_sized_proxies(part, size, group_id) for part in proxies)
+    surface_target, surface_target_flipped = (_sized_proxies(part, size, group_id) for part in targets)
     return Group(
         group_id=group_id,
         names=list(names),
@@ -89,6 +107,8 @@ def to_group(
         reference_pixel_values=normalize_pixels(arrays["reference"], processor) if "reference" in arrays else None,
         reference_target=reference_target,
         surface=surface,
+        surface_target=surface_target,
+        surface_target_flipped=surface_target_flipped,
     )
 
 

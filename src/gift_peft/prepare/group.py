@@ -21,7 +21,7 @@ from gift_peft.prepare.matching import Frame
 from gift_peft.prepare.quality import SmallFrame, check_frames, check_group_change, pairwise_changes
 from gift_peft.prepare.registration import Registration, register, valid_area, warp
 from gift_peft.prepare.settings import QualitySettings, RegistrationSettings
-from gift_peft.rules import check_count, check_group_id
+from gift_peft.rules import check_count, check_group_id, check_pair
 
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything
 # Remarks that count for a treated reference; inside the target it differs by design.
@@ -143,6 +143,8 @@ def decode(capture: Capture, entry: GroupEntry) -> tuple[list[Photo], Photo | No
         if str(path) != printable(str(path)):
             raise ValueError(f"{path}: the name is not valid Unicode text; rename the file")
     decoded = decode_capture(capture)
+    if capture.split == "train":
+        check_pair(capture.group_id, len(decoded.kept))
     size = decoded.images[0].size
     entry.size = list(size)
     if min(size) < MIN_SIDE:
@@ -269,6 +271,8 @@ def check_left(count: int, reference: Photo | None, job: Job, entry: GroupEntry)
         entry.warnings.append(Remark("reference_dropped", f"the treated reference is dropped: {text}"))
     try:
         check_count(job.group_id, count, job.split, reference is not None and not reference.dropped)
+        if job.split == "train":
+            check_pair(job.group_id, count)
     except ValueError:
         frames = [frame for frame in entry.frames if frame.status == "dropped"]
         dropped = "; ".join(f"{frame.name}: {', '.join(item.text for item in frame.reasons)}" for frame in frames)

@@ -41,11 +41,15 @@ class SavedRun:
         return float(self.arguments["lambda_c"]), float(self.arguments["lambda_d"])
 
     def best_row(self) -> dict | None:
-        """The row of the minimum-GCE checkpoint (the base does not count); without validation GCE the last row."""
+        """The row of adapter/: of the smallest validation GCE, or what the run chose by (the base does not count).
+
+        The last row where that was not measured.
+        """
+        metric = f"val_{self.arguments.get('metric_for_best_model', 'gce')}"
         rows = [row for row in self.history if row["step"] > 0]
-        measured = [row for row in rows if row.get("val_gce") is not None]
+        measured = [row for row in rows if row.get(metric) is not None]
         if measured:
-            return min(measured, key=lambda row: row["val_gce"])
+            return min(measured, key=lambda row: row[metric])
         return rows[-1] if rows else None
 
 

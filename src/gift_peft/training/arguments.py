@@ -16,6 +16,7 @@ from typing import Literal, get_origin
 
 import yaml
 
+from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.files import read_yaml
 from gift_peft.models.pixels import parse_size
 from gift_peft.options import OptionParser
@@ -34,6 +35,8 @@ FREE_TO_CHANGE = {
     "group_cache_dir",
     "gradient_checkpointing",  # recomputes the same bits
     "profile",
+    "per_device_train_batch_size",  # how many images an update takes must stay: their product with the processes
+    "gradient_accumulation_steps",
     "checkpointing_steps",
     "checkpoints_total_limit",
     "checkpoint_at_steps",
@@ -49,15 +52,47 @@ FREE_TO_CHANGE = {
 # Part of what a run is where its learning rate falls over its length, or where eval_delay lets its end be chosen.
 LENGTH = {"num_train_epochs", "max_steps"}
 
+# What one objective takes and the other refuses.
+OWN = {
+    "consensus": ("micro_batch_size", "retain", "profile"),
+    "surface": (
+        "per_device_train_batch_size",
+        "gradient_accumulation_steps",
+        "flip",
+        "fills",
+        "surface_model",
+        "surface_quantile",
+        "surface_tau",
+    ),
+}
+LAMBDA_C = {"consensus": 1.0, "surface": 2.0}
 
 RANGES = (
     (
-        ("lora_rank", "micro_batch_size", "num_train_epochs", "checkpointing_steps", "checkpoints_total_limit"),
+        (
+            "lora_rank",
+            "micro_batch_size",
+            "per_device_train_batch_size",
+            "gradient_accumulation_steps",
+            "num_train_epochs",
+            "checkpointing_steps",
+            "checkpoints_total_limit",
+        ),
         lambda value: value >= 1,
         "must be at least 1",
     ),
     (
-        ("lambda_c", "lambda_d", "weight_decay", "dataloader_num_workers", "eval_delay", "profile", "seed"),
+        (
+            "lambda_c",
+            "lambda_d",
+            "weight_decay",
+            "max_grad_norm",
+            "warmup_steps",
+            "dataloader_num_workers",
+            "eval_delay",
+            "profile",
+            "seed",
+        ),
         lambda value: 0 <= value < math.inf,
         "must be finite and not negative",
     ),
@@ -99,19 +134,37 @@ class GiftTrainingArguments:
     )
     size: str | None = _arg("HEIGHTxWIDTH at the network; default: the recipe's (476x644)", None)
 
-    lambda_c: float = _arg("weight of the group consistency, Eq. 6", 1.0)
+    target: Literal["consensus", "surface"] = _arg(
+        "what the prediction inside the target is pulled to: what its group agrees on (the paper), or the surface "
+        "target, computed once from the frozen model",
+        "consensus",
+    )
+    lambda_c: float | None = _arg(
+        "weight of the group consistency, Eq. 6, or of the distance to the surface target; default 1 for consensus, "
+        "2 for surface",
+        None,
+    )
     lambda_d: float = _arg("weight of the self-distillation, Eq. 6; 0 collapses the depth", 1.0)
     micro_batch_size: int = _arg("images per forward; bounds the memory, not the gradient", 2)
     retain: str = _arg("images whose graphs are kept instead of replayed: 0 (the paper), a number, or auto", "auto")
+    per_device_train_batch_size: int = _arg("surface: images per forward, of any groups", 4)
+    gradient_accumulation_steps: int = _arg("surface: forwards per update and process", 1)
+    flip: bool = _arg("surface: show every second image as in a mirror, with its own target", False)
+    fills: int = _arg("surface: copies of each photo with its target painted, which the targets are made from", 6)
+    surface_model: Literal["auto", "plane", "quantile"] = _arg("surface: what a surface is taken for", "auto")
+    surface_quantile: float = _arg("surface: of inverse depth over the observations; higher is nearer", 0.8)
+    surface_tau: float = _arg("surface: share of the predictions below the plane", 0.7)
     gradient_checkpointing: bool = _arg(
         "recompute the blocks in the backward; smaller graphs, more are retained", False
     )
     compile: bool = _arg("torch.compile the encoder's blocks; changes the bits", False)
     channels_last: bool = _arg("the head's convolutions in channels-last layout; changes the bits", False)
-    num_train_epochs: int = _arg("passes over the groups, one update per group", 50)
+    num_train_epochs: int = _arg("passes over the groups (one update per group) or, for surface, their images", 50)
     max_steps: int = _arg("stop after this many updates; -1: num_train_epochs decides", -1)
     learning_rate: float = _arg("Adam's learning rate at the first update", 2e-5)
     lr_scheduler_type: Literal["constant", "linear"] = _arg("constant, or falling linearly towards 0", "constant")
+    warmup_steps: int = _arg("updates over which the learning rate rises to its first value", 0)
+    max_grad_norm: float = _arg("scale the gradient down to this norm; 0 leaves it as it is", 0.0)
     adam_beta1: float = _arg("Adam's beta1", 0.9)
     adam_beta2: float = _arg("Adam's beta2", 0.999)
     adam_epsilon: float = _arg("Adam's epsilon", 1e-8)
@@ -125,6 +178,9 @@ class GiftTrainingArguments:
         "folder for groups at network size, shared by runs; default: gift-peft/groups in the Hugging Face cache", None
     )
 
+    metric_for_best_model: Literal["gce", "normalized_gce", "tom_rmse"] = _arg(
+        "which validation figure, at its smallest, chooses adapter/", "gce"
+    )
     eval_delay: int = _arg(
         "epochs before the first validation, and so before adapter/ may be chosen; the end is always validated. While "
         "the learning rate is high, the smallest GCE may be bought outside the target",
@@ -173,6 +229,7 @@ class GiftTrainingArguments:
         if any(step < 1 for step in self.checkpoint_at_steps):
             raise ValueError(f"checkpoint_at_steps: must be at least 1, got {min(self.checkpoint_at_steps)}")
         self._check_recipe()
+        self._check_objective()
         if self.overwrite_output_dir and self.resume_from_checkpoint:
             raise ValueError("overwrite_output_dir and resume_from_checkpoint exclude each other")
 
@@ -187,10 +244,35 @@ class GiftTrainingArguments:
         except re.error as error:
             raise ValueError(f"target_modules: not a regular expression: {error}") from None
 
+    def _check_objective(self) -> None:
+        """Refuse what only the other objective takes; settle what has a default for each."""
+        if self.target not in OWN:
+            raise ValueError(f"target: {self.target!r} is neither consensus nor surface")
+        defaults = {f.name: f.default for f in fields(self)}
+        for name in self._foreign():
+            if getattr(self, name) != defaults[name]:
+                raise ValueError(f"{name}: target: {self.target} does not take it")
+        if self.lambda_c is None:
+            self.lambda_c = LAMBDA_C[self.target]
+        self.surface_settings()
+
+    def _foreign(self) -> tuple[str, ...]:
+        (other,) = OWN.keys() - {self.target}
+        return OWN[other]
+
+    def surface_settings(self) -> SurfaceSettings:
+        """How this run's surface targets are made. The fills' colors do not depend on the run's seed."""
+        options = ("fills", "surface_model", "surface_quantile", "surface_tau")
+        return SurfaceSettings(**{name: getattr(self, name) for name in options})
+
+    def values(self) -> dict:
+        """All values by name, without those that only the other objective takes."""
+        return {name: value for name, value in asdict(self).items() if name not in self._foreign()}
+
     def to_yaml(self) -> str:
         """All values as `--config` reads them, without what is None or empty and without the two about resuming."""
         skip = ("config", "overwrite_output_dir", "resume_from_checkpoint")
-        values = {k: v for k, v in asdict(self).items() if k not in skip and v is not None and v != []}
+        values = {k: v for k, v in self.values().items() if k not in skip and v is not None and v != []}
         return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
 

@@ -12,7 +12,7 @@ import re
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 import torch
@@ -42,7 +42,10 @@ TEMPORARY = re.compile(
 
 @dataclass
 class State:
-    """Where a run stands; all of it is in `trainer_state.json`. The sums are over the groups of this epoch so far."""
+    """Where a run stands; all of it is in `trainer_state.json`.
+
+    The sums are over the groups of this epoch so far; where updates take single images, over those.
+    """
 
     step: int = 0
     rows: list[dict] = field(default_factory=list)
@@ -54,20 +57,20 @@ class State:
     num_groups: int = 0
     num_groups_with_pair: int = 0
 
-    def add(self, loss: float, consistency: float, distillation: float, num_pairs: int) -> None:
-        """Count one group."""
-        self.loss += loss
-        self.consistency += consistency
-        self.distillation += distillation
-        self.num_groups += 1
+    def add(self, loss: float, consistency: float, distillation: float, num_pairs: int, count: int = 1) -> None:
+        """Count one group; or `count` images without pairs, whose means these are."""
+        self.loss += loss * count
+        self.consistency += consistency * count
+        self.distillation += distillation * count
+        self.num_groups += count
         if num_pairs:  # GCE leaves out groups without a pair, the loss counts them as 0
             self.gce += consistency
             self.num_groups_with_pair += 1
 
-    def close_epoch(self, epoch_steps: int, measured: dict) -> bool:
+    def close_epoch(self, epoch_steps: int, measured: dict, metric: str = "val_gce") -> bool:
         """Add a row, the means since the last one and what was measured; the sums start again.
 
-        Returns whether its validation GCE is the smallest so far, the base's apart.
+        Returns whether its `metric` is the smallest so far, the base's apart.
         """
         epoch = self.step / epoch_steps
         row: dict = {"step": self.step, "epoch": int(epoch) if epoch.is_integer() else epoch}
@@ -79,7 +82,7 @@ class State:
         row = jsonable(row | measured)
         self.rows.append(row)
         best = self.row_of(self.best_step)
-        if not self.step or row["val_gce"] is None or (best is not None and row["val_gce"] >= best["val_gce"]):
+        if not self.step or row[metric] is None or (best is not None and row[metric] >= best[metric]):
             return False
         self.best_step = self.step
         return True
@@ -168,8 +171,10 @@ def run_identity(
     fingerprint = [None]
     if accelerator.is_main_process:
         fingerprint = ["-".join(map(dataset_fingerprint, splits))]
+    images = args.per_device_train_batch_size * args.gradient_accumulation_steps * accelerator.num_processes
     return {
-        **{name: value for name, value in asdict(args).items() if name not in free},
+        **{name: value for name, value in args.values().items() if name not in free},
+        **({"images_per_update": images} if args.target == "surface" else {}),
         "model_name_or_path": teacher_revision(args.model_name_or_path, args.model_revision),
         "dataset_name": broadcast_object_list(fingerprint)[0],
         # The fingerprint does not depend on it, the order of the updates does.
@@ -180,7 +185,12 @@ def run_identity(
 
 
 def _check_identity(before: dict, now: dict) -> None:
-    """Raise ValueError naming the first argument of a run's identity that changed since the checkpoint."""
+    """Raise ValueError naming the first argument of a run's identity that changed since the checkpoint.
+
+    An argument that is younger than the checkpoint had its default.
+    """
+    defaults = {f.name: f.default for f in fields(GiftTrainingArguments) if f.name in now}
+    before = defaults | before
     changed = {
         "model_name_or_path": "the base model's weights have",
         "dataset_name": "its images, masks or groups have",

@@ -1,11 +1,11 @@
 """A GIFT run from arguments to adapter (paper section 4, implementation details), top to bottom.
 
-Check -> load the frozen model -> data with its proxies -> the group step on the paper's trainable parts -> fit: one
+Check -> load the frozen model -> data with its proxies -> the objective on the paper's trainable parts -> fit: one
 Adam update per group of images, the groups shuffled once per epoch, a validation after every epoch (from `eval_delay`
-on) -> finish: the adapter with the smallest validation GCE.
+on) -> finish: the adapter with the smallest validation GCE. With `target: surface` an update is a batch of images.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -21,17 +21,19 @@ from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import GiftRecipe, get_gift_model, get_recipe
 from gift_peft.dataset.cache import default_cache_dir
 from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
-from gift_peft.dataset.loader import PreparedGroups, epoch_order
+from gift_peft.dataset.loader import PreparedGroups
 from gift_peft.dataset.tensors import Group
-from gift_peft.group_step import GroupStep
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.models.pixels import resolve_size
 from gift_peft.reports.model_card import model_card
+from gift_peft.rules import check_pair
 from gift_peft.training import checkpoints, upload, validation
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.checkpoints import State, write_metrics
+from gift_peft.training.objectives import OBJECTIVES, Consensus, Losses, Share, Surface
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress, how_to_resume, summary
+from gift_peft.training.schedule import Schedule
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
 from gift_peft.training.start import (
     Interrupted,
@@ -98,26 +100,27 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
     # data
     groups = _groups(args, processor, size, accelerator)
     train_groups, validation_groups = groups["train"], groups.get("validation")
-    schedule = Schedule(args, len(train_groups))
     identity = checkpoints.run_identity(args, [part.dataset for part in groups.values()], size, accelerator)
 
-    # step
-    step, optimizer = _step(args, base, recipe, accelerator)
+    # objective
+    network, optimizer = _adapted(args, base, recipe, accelerator)
+    objective = OBJECTIVES[args.target](args, train_groups, network, optimizer, accelerator)
+    optimizer, schedule = objective.optimizer, Schedule(args, objective.epoch_steps)
     if args.profile:
-        with closing(train_groups.take(schedule.order(0))) as feed:
-            accelerator.print(profile_updates(args.profile, step, optimizer, train_groups, feed))
+        with closing(objective.feed(0)) as feed:
+            accelerator.print(profile_updates(args.profile, objective.step, optimizer, train_groups, feed))
         return TrainResult(output, 0, [], None)
 
     # fit
     state = State()
     if checkpoint:
         state = checkpoints.restore(
-            checkpoint, output, identity, schedule.total_steps, step.model, optimizer, accelerator
+            checkpoint, output, identity, schedule.total_steps, network, optimizer, accelerator
         )
     claim_folder(args, accelerator, fresh=checkpoint is None)
     if args.report_to != "none":
         accelerator.init_trackers("gift-peft", {k: str(v) for k, v in asdict(args).items()})
-    trained = sum(p.numel() for p in step.model.parameters() if p.requires_grad)
+    trained = sum(p.numel() for p in network.parameters() if p.requires_grad)
     accelerator.print(
         f"{len(train_groups)} train and {len(validation_groups or ())} validation groups at {size[0]}x{size[1]}, "
         f"{schedule.total_steps} updates of {trained / 1e6:.2f} M weights, autocast {accelerator.mixed_precision}"
@@ -136,19 +139,19 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
         "base_revision": identity["model_name_or_path"],
         "dataset_fingerprint": identity["dataset_name"],
     }
-    save = partial(_save_adapter, args, step.model, processor, about)
+    save = partial(_save_adapter, args, network, processor, about, schedule.epoch_steps)
 
     def save_checkpoint() -> None:
         """`checkpoint-<step>/`, then delete those that are too many."""
         if accelerator.is_main_process:
             save_files = partial(save, state=state, with_card=False)
-            checkpoints.write_checkpoint(output, state, identity, save_files, step.model, optimizer)
+            checkpoints.write_checkpoint(output, state, identity, save_files, network, optimizer)
             checkpoints.prune_checkpoints(output, state.step, args.checkpoints_total_limit, args.checkpoint_at_steps)
         accelerator.wait_for_everyone()
 
-    model = DepthModel(step.model, processor, size, kind)
-    measure = partial(validation.measure, model, validation_groups, args.booster_root, accelerator)
-    signum = _fit(state, schedule, step, optimizer, train_groups, measure, save, save_checkpoint, output)
+    model, metric = DepthModel(network, processor, size, kind), f"val_{args.metric_for_best_model}"
+    measure = partial(validation.measure, model, validation_groups, args.booster_root, accelerator, metric)
+    signum = _fit(state, schedule, objective, accelerator, measure, save, save_checkpoint, output)
 
     # finish
     if signum:
@@ -180,70 +183,36 @@ def _groups(
     if "train" not in splits:
         raise ValueError(f"dataset_name: {args.dataset_name} has no train split")
     places = {"proxies_dir": args.proxies_dir, "revision": args.model_revision, "size": size}
+    surface = args.surface_settings() if args.target == "surface" else None
     try:
-        make_proxies(args.model_name_or_path, args.dataset_name, accelerator=accelerator, **places)
+        make = partial(make_proxies, args.model_name_or_path, args.dataset_name, accelerator=accelerator, **places)
+        make()
+        if surface is not None:
+            make(["train"], surface=surface, kind=args.prediction_kind)
     except PermissionError as error:
-        options = ("x".join(map(str, size)), args.proxies_dir, args.model_revision)
+        options = ("x".join(map(str, size)), args.proxies_dir, args.model_revision, surface)
         command = proxies_command(args.model_name_or_path, args.dataset_name, *options)
         raise PermissionError(f"proxies are missing and {error.filename} cannot be written: `{command}`") from None
     cache_dir = Path(args.group_cache_dir) if args.group_cache_dir else default_cache_dir()
     groups = {}
     for split in ("train", "validation"):
         if split in splits:
-            rows = load_gift_i(args.dataset_name, split, teacher=args.model_name_or_path, **places)
+            asked = {"surface": surface if split == "train" else None, **places}
+            rows = load_gift_i(args.dataset_name, split, teacher=args.model_name_or_path, **asked)
+            if split == "train" and surface is None:
+                for group_id, names in zip(rows["group_id"], rows["image_names"], strict=True):
+                    check_pair(group_id, len(names))
             groups[split] = PreparedGroups(rows, processor, size, args.dataloader_num_workers, cache_dir)
     return groups
 
 
-@dataclass
-class Schedule:
-    """How long a run is, and what is due after so many updates: arithmetic on the arguments and the number of groups.
-
-    An epoch takes as many updates as there are groups.
-    """
-
-    args: GiftTrainingArguments
-    epoch_steps: int
-
-    @property
-    def total_steps(self) -> int:
-        return self.args.max_steps if self.args.max_steps > 0 else self.args.num_train_epochs * self.epoch_steps
-
-    def order(self, step: int) -> Iterator[int]:
-        """The groups of all updates after `step`, without end."""
-        epoch, done = divmod(step, self.epoch_steps)
-        while True:
-            yield from epoch_order(self.epoch_steps, self.args.seed, epoch)[done:]
-            epoch, done = epoch + 1, 0
-
-    def learning_rate(self, step: int) -> float:
-        """Of the update after `step`: from the step alone, so that a resumed run needs no state of a scheduler."""
-        falling = self.args.lr_scheduler_type == "linear"
-        return self.args.learning_rate * (1 - step / self.total_steps) if falling else self.args.learning_rate
-
-    def row_is_due(self, state: State) -> bool:
-        """At the start, after every epoch and at the end, unless it was written before an interruption."""
-        at = state.step % self.epoch_steps == 0 or state.step == self.total_steps
-        return at and (not state.rows or state.rows[-1]["step"] != state.step)
-
-    def validation_is_due(self, step: int) -> bool:
-        """With a row, but not between the base's and that of epoch `eval_delay` or the end."""
-        return not 0 < step < min(self.args.eval_delay * self.epoch_steps, self.total_steps)
-
-    def checkpoint_is_due(self, step: int) -> bool:
-        every = self.args.checkpointing_steps or self.epoch_steps
-        return step > 0 and (step % every == 0 or step in self.args.checkpoint_at_steps or step == self.total_steps)
-
-
-def _step(
+def _adapted(
     args: GiftTrainingArguments, base: torch.nn.Module, recipe: GiftRecipe, accelerator: Accelerator
-) -> tuple[GroupStep, torch.optim.Adam]:
-    """The group step, whose `model` is the base with a fresh adapter, and its optimizer."""
+) -> tuple[PeftModel, torch.optim.Adam]:
+    """The base with a fresh adapter, and its optimizer."""
     set_seed(args.seed)  # the same on every process, so that the adapters start equal
     model = get_gift_model(base, rank=args.lora_rank, head=args.head, recipe=recipe)
-    # No DDP: GroupStep sums the gradients of a group over the processes itself, and autocasts itself, so that
-    # validation and the proxies stay in float32. Eval mode: a replay must repeat its snapshot.
-    model = model.to(accelerator.device).eval()
+    model = model.to(accelerator.device).eval()  # eval mode: a replay must repeat its snapshot
     if args.gradient_checkpointing:
         checkpoint_blocks(model)
     if args.channels_last:
@@ -257,26 +226,24 @@ def _step(
         eps=args.adam_epsilon,
         weight_decay=args.weight_decay,
     )
-    step = GroupStep(model, args.lambda_c, args.lambda_d, args.micro_batch_size, args.retain, accelerator)
-    return step, optimizer
+    return model, optimizer
 
 
 def _fit(
     state: State,
     schedule: Schedule,
-    step: GroupStep,
-    optimizer: torch.optim.Optimizer,
-    groups: PreparedGroups,
+    objective: Consensus | Surface,
+    accelerator: Accelerator,
     measure: Callable[[bool, Callable[[], int]], dict],
     save: Callable[[Path, State], None],
     save_checkpoint: Callable[[], None],
     output: Path,
 ) -> int:
     """Update after update up to the last one or a signal, which is returned (else 0); `state` moves along."""
-    accelerator, first = step.accelerator, state.step + 1
+    first, is_main = state.step + 1, accelerator.is_main_process
     with (
-        closing(Progress(schedule.total_steps, state.step, accelerator.is_main_process)) as progress,
-        closing(groups.take(schedule.order(state.step))) as feed,
+        closing(Progress(schedule.total_steps, state.step, is_main, objective.unit, objective.term)) as progress,
+        closing(objective.feed(state.step)) as feed,
         stop_signals() as stop,
     ):
         while not (signum := agree(stop.signum, accelerator)):
@@ -286,10 +253,11 @@ def _fit(
                 except Interrupted:  # a resumed run begins with this row
                     continue
                 if state.step == 0:
-                    for losses in validation.measure_base(groups, step.lambda_c, not accelerator.is_main_process):
+                    for losses in objective.first_look(not is_main):
                         state.add(*losses)
-                is_best = state.close_epoch(schedule.epoch_steps, measured)
-                if accelerator.is_main_process:
+                metric = f"val_{schedule.args.metric_for_best_model}"
+                is_best = state.close_epoch(schedule.epoch_steps, measured, metric)
+                if is_main:
                     if is_best:
                         save(output / "adapter", state)
                     write_metrics(output, state.rows)
@@ -300,36 +268,41 @@ def _fit(
                 progress.row(state.rows[-1], schedule.total_steps / schedule.epoch_steps)
             if state.step >= schedule.total_steps:
                 break
-            optimizer.param_groups[0]["lr"] = schedule.learning_rate(state.step)
-            group = next(feed)
+            objective.optimizer.param_groups[0]["lr"] = schedule.learning_rate(state.step)
+            item = next(feed)
             try:
-                loss, consistency, distillation, num_pairs = _update(step, optimizer, group)
+                losses = _update(objective, item, accelerator, schedule.args.max_grad_norm)
             except (ValueError, torch.OutOfMemoryError) as error:
                 last = checkpoints.last_complete(output)
-                raise ValueError(f"step {state.step + 1}, group {group.group_id}: {error}; {last}") from error
+                raise ValueError(f"step {state.step + 1}, {objective.named(item)}: {error}; {last}") from error
             state.step += 1
-            state.add(loss, consistency, distillation, num_pairs)
-            losses = {"loss": loss, "consistency": consistency, "distillation": distillation}
-            accelerator.log(losses, step=state.step)
+            state.add(*losses)
+            logged = {"loss": losses.total, "consistency": losses.consistency, "distillation": losses.distillation}
+            accelerator.log(logged, step=state.step)
             if schedule.checkpoint_is_due(state.step) and not schedule.row_is_due(state):
                 save_checkpoint()
-            progress.step(loss, consistency)
-            if state.step == first and step.budget is not None:
-                progress.say(str(step.budget))
+            progress.step(losses.total, losses.consistency)
+            if state.step == first and str(objective):
+                progress.say(str(objective))
         if signum:
             save_checkpoint()
     return signum
 
 
-def _update(step: GroupStep, optimizer: torch.optim.Optimizer, group: Group) -> tuple[float, float, float, int]:
-    """One Adam step on one group (Eq. 6); returns (loss, consistency, distillation, number of pairs)."""
-    output = step.accumulate(group.pixel_values, group.mask, group.target, group.valid, group.names)
+def _update(
+    objective: Consensus | Surface, item: Group | Share, accelerator: Accelerator, max_grad_norm: float
+) -> Losses:
+    """One Adam step on what an update takes."""
+    optimizer = objective.optimizer
+    losses = objective.accumulate(item)
+    weights = optimizer.param_groups[0]["params"]
+    if max_grad_norm:
+        accelerator.clip_grad_norm_(weights, max_grad_norm)
     optimizer.step()
-    weights = [p.detach() for p in optimizer.param_groups[0]["params"]]
-    if not torch.nn.utils.get_total_norm(weights, torch.inf).isfinite():
+    if not torch.nn.utils.get_total_norm([p.detach() for p in weights], torch.inf).isfinite():
         raise ValueError("the update made weights NaN or infinite")
     optimizer.zero_grad(set_to_none=True)
-    return float(output.total), float(output.consistency), float(output.distillation), output.num_pairs
+    return losses
 
 
 def _save_adapter(
@@ -337,6 +310,7 @@ def _save_adapter(
     model: PeftModel,
     processor: Any,
     about: dict,
+    epoch_steps: int,
     folder: Path,
     state: State,
     with_card: bool = True,
@@ -345,7 +319,7 @@ def _save_adapter(
     record = upload.run_record(
         args,
         step=state.step,
-        epoch=state.step / about["num_groups"],
+        epoch=state.step / epoch_steps,
         **about,
         metrics={"base": state.row_of(0), "adapter": state.row_of(state.step)},
     )
@@ -358,7 +332,7 @@ def _save_adapter(
             processor=processor,
             size=tuple(about["size"]),
             gift=record,
-            card=model_card(asdict(args), record) if with_card else None,
+            card=model_card(args.values(), record) if with_card else None,
         )
 
 
@@ -370,6 +344,6 @@ def _finish(
     save(output / "adapter-last", state)
     if state.best_step is None:
         save(adapter, state)
-    print(summary(adapter, state.rows, state.best_step, validated))
+    print(summary(adapter, state.rows, state.best_step, validated, args.metric_for_best_model))
     if args.push_to_hub:
         print(f"Uploaded: https://huggingface.co/{upload.push(adapter, args)}")

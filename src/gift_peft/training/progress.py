@@ -17,16 +17,18 @@ class Progress:
     Args:
         total, done: updates of the whole run, and those made before it was interrupted.
         enabled: False on all processes but one.
+        unit: what an update takes.
+        term: what the consistency of this objective is called.
     """
 
-    def __init__(self, total: int, done: int, enabled: bool) -> None:
-        self.enabled = enabled
+    def __init__(self, total: int, done: int, enabled: bool, unit: str = "group", term: str = "GCE") -> None:
+        self.enabled, self.unit, self.term = enabled, unit, term
         self.total, self.first, self.done = total, done, done
         self.started = time.monotonic()
         self.bar = tqdm(
             total=total,
             initial=done,
-            unit="group",
+            unit=unit,
             desc="GIFT",
             dynamic_ncols=True,
             disable=not enabled or not sys.stderr.isatty(),
@@ -35,13 +37,13 @@ class Progress:
     def step(self, loss: float, consistency: float) -> None:
         """One update has been made."""
         self.done += 1
-        self.bar.set_postfix(loss=number(loss), GCE=number(consistency), refresh=False)
+        self.bar.set_postfix({"loss": number(loss), self.term: number(consistency)}, refresh=False)
         self.bar.update()
 
     def row(self, row: dict, epochs: float) -> None:
         """The line of one row of metrics.jsonl."""
         parts = [f"epoch {row['epoch']:g}/{epochs:g}  step {row['step']}  loss {number(row['loss'])}"]
-        parts.append(f"GCE {number(row['train_gce'])}")
+        parts.append(f"{self.term} {number(row['train_gce' if self.term == 'GCE' else 'consistency'])}")
         if row["val_gce"] is not None:
             parts.append(f"validation GCE {number(row['val_gce'])}")
         if row["val_tom_rmse"] is not None:
@@ -49,7 +51,7 @@ class Progress:
         if self.done > self.first:
             rate = (self.done - self.first) / (time.monotonic() - self.started)
             left = round((self.total - self.done) / rate)
-            parts.append(f"{rate:.2f} groups/s  {left // 3600:d}:{left // 60 % 60:02d}:{left % 60:02d} left")
+            parts.append(f"{rate:.2f} {self.unit}s/s  {left // 3600:d}:{left // 60 % 60:02d}:{left % 60:02d} left")
         self.say("  ".join(parts))
 
     def say(self, text: str) -> None:
@@ -62,12 +64,15 @@ class Progress:
         self.bar.close()
 
 
-def summary(adapter: Path, rows: list[dict], best_step: int | None, validated: bool) -> str:
-    """The last lines of a run: which adapter is kept, and what it changed."""
+def summary(adapter: Path, rows: list[dict], best_step: int | None, validated: bool, metric: str) -> str:
+    """The last lines of a run: which adapter is kept, where the smallest `metric` chose it, and what it changed."""
     row = next(row for row in reversed(rows) if best_step in (None, row["step"]))
     lines = [f"Adapter: {adapter} (step {row['step']})"]
     if validated and best_step is None:
-        lines.append("  In no validation group two target masks meet: it is the last adapter, chosen by nothing")
+        why = "No validation group has a treated reference"
+        if metric != "tom_rmse":
+            why = "In no validation group two target masks meet"
+        lines.append(f"  {why}: it is the last adapter, chosen by nothing")
     for title, key in (("validation GCE", "val_gce"), ("ToM RMSE", "val_tom_rmse"), ("Other RMSE", "val_other_rmse")):
         before, after = rows[0][key], row[key]
         if after is not None:

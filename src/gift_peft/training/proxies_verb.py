@@ -1,26 +1,48 @@
 """`gift-peft proxies`: its options. `teacher` beside it does the work."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 
+from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.options import OptionParser, add_base, add_dataset
+from gift_peft.rules import KINDS
+from gift_peft.surface_targets import MODELS
 
 
 def make_parser() -> OptionParser:
     parser = OptionParser(
         "proxies",
-        "Keep the frozen model's predictions for a dataset.",
+        "Keep the frozen model's predictions for a dataset, or the surface targets computed from them.",
         "gift-peft proxies --base depth-anything/Depth-Anything-V2-Small-hf --dataset gift-i",
     )
     add_base(parser)
     add_dataset(parser)
     parser.add_argument("--splits", nargs="+", metavar="SPLIT", help="default: all")
     parser.add_argument("--proxies-dir", metavar="DIR", help="default: DATASET/proxies")
-    parser.add_argument("--overwrite", action="store_true", help="make every proxy again")
+    parser.add_argument("--overwrite", action="store_true", help="make again what is there: proxies, or with --target")
+    surface = parser.add_argument_group("surface targets", "where the surfaces are, by what the frozen model predicts")
+    surface.add_argument("--target", choices=["surface"], help="also make the surface targets")
+    text = {
+        "fills": "copies of each photo with its target painted in one color; 0 is allowed",
+        "seed": "of their colors",
+        "surface_model": "auto: a plane where it fits, else the quantile",
+        "surface_quantile": "of inverse depth, higher is nearer",
+        "surface_tau": "share of the predictions below the plane",
+    }
+    for field in fields(SurfaceSettings):
+        options = {"choices": MODELS} if field.name == "surface_model" else {"type": type(field.default)}
+        name = f"--{field.name.replace('_', '-')}"
+        surface.add_argument(name, default=field.default, help=text[field.name], **options)
+    surface.add_argument("--kind", choices=KINDS, help="what is predicted, if no recipe says it")
     return parser
 
 
 def run(argv: Sequence[str]) -> int:
-    args = make_parser().parse_args(argv)
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    settings = SurfaceSettings(**{field.name: getattr(args, field.name) for field in fields(SurfaceSettings)})
+    if args.target is None and (settings != SurfaceSettings() or args.kind):
+        parser.error("fills, seed, kind and the surface options are for --target surface")
     from gift_peft.training.teacher import make_proxies
 
     folder = make_proxies(
@@ -31,6 +53,8 @@ def run(argv: Sequence[str]) -> int:
         proxies_dir=args.proxies_dir,
         revision=args.revision,
         overwrite=args.overwrite,
+        surface=settings if args.target else None,
+        kind=args.kind,
     )
-    print(f"Proxies: {folder}")
+    print(f"{'Surface targets' if args.target else 'Proxies'}: {folder}")
     return 0

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import torch
 from accelerate import Accelerator, PartialState
 from accelerate.state import AcceleratorState
-from accelerate.utils import ProjectConfiguration, parse_flag_from_env
+from accelerate.utils import DistributedDataParallelKwargs, ProjectConfiguration, parse_flag_from_env
 
 from gift_peft.evaluation.booster_scenes import find_booster
 from gift_peft.files import write_whole
@@ -41,6 +41,8 @@ def make_accelerator(args: GiftTrainingArguments) -> Accelerator:
         mixed_precision=precision,
         log_with=None if args.report_to == "none" else args.report_to,
         project_config=ProjectConfiguration(project_dir=args.output_dir, logging_dir=str(logs)),
+        # Of target: surface alone. A head may hold weights that no prediction needs; buffers never change.
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True, broadcast_buffers=False)],
     )
 
 
@@ -111,7 +113,7 @@ def stop_signals() -> Iterator[SimpleNamespace]:
             raise KeyboardInterrupt
         stop.signum = signum
         # Not print: the signal may have come in the middle of one.
-        os.write(2, b"\nStopping after this group; Ctrl-C again stops at once, without a checkpoint\n")
+        os.write(2, b"\nStopping after this update; Ctrl-C again stops at once, without a checkpoint\n")
 
     if threading.current_thread() is not threading.main_thread():
         yield stop  # Python delivers signals to the main thread only

@@ -1,32 +1,41 @@
 """The teacher: the frozen base model, asked once for every image before training starts (paper section 4, proxies).
 
 Proxies are float32 and made with the same cut into micro-batches as the group step, so at the first training step the
-self-distillation of a model whose adapter is still zero is exactly zero.
+self-distillation of a model whose adapter is still zero is exactly zero. Surface targets are computed from the
+proxies, and from what the teacher predicts for the flipped photos and for fills (surface_targets.py).
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from accelerate import PartialState
 from accelerate.utils import gather_object, parse_flag_from_env
+from PIL import Image
 from tqdm import tqdm
 
 from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
 from gift_peft.dataset.proxies import (
+    SURFACE_SUFFIX,
+    ProxyStore,
+    SurfaceSettings,
     default_proxies_dir,
     difference,
     make_header,
+    mask_digests,
     picture_digests,
     read_header,
     write_proxies,
+    write_surface,
 )
 from gift_peft.dataset.rows import parsed
 from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.models.loading import DepthModel
-from gift_peft.models.pixels import pixel_settings
+from gift_peft.models.pixels import pixel_settings, resize_mask
 from gift_peft.rules import GroupPictures
+from gift_peft.surface_targets import paint_fills, surface_target
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -42,6 +51,8 @@ def make_proxies(
     revision: str | None = None,
     accelerator: "Accelerator | None" = None,
     overwrite: bool = False,
+    surface: SurfaceSettings | None = None,
+    kind: str | None = None,
 ) -> Path:
     """Predict every image and treated reference of a dataset and keep it for training and evaluation.
 
@@ -57,48 +68,67 @@ def make_proxies(
         proxies_dir (`str` or `Path`, *optional*): default the dataset's own `proxies` folder, or a cache folder for
             hub ids and folders that cannot be written (`default_proxies_dir`).
         accelerator (`Accelerator`, *optional*): its device and processes; default what `accelerate launch` set up.
-        overwrite (`bool`): make every proxy again instead of refusing stale ones.
+        overwrite (`bool`): make every proxy again instead of refusing stale ones; with `surface`, every surface target
+            (proxies that hold are kept).
+        surface (`SurfaceSettings`, *optional*): also make the surface targets, with these settings.
+        kind (`str`, *optional*): what the teacher predicts, for surface targets; default what its recipe says.
 
     Returns:
         `Path`: `<proxies_dir>/<teacher>`.
 
     Raises:
-        ValueError, OSError: in every process, one line naming the file, or group and image: stale proxies, NaN
-            predictions, unreadable data, a folder that cannot be written.
+        ValueError, OSError: in every process, one line naming the file, or group and image: stale proxies or surface
+            targets, NaN predictions, unreadable data, a folder that cannot be written, an unknown kind.
     """
     state = accelerator or PartialState(cpu=parse_flag_from_env("ACCELERATE_USE_CPU"))
     identity = teacher_id(base, revision)
     pinned = teacher_revision(base, revision)
-    model = DepthModel.from_pretrained(base, revision=revision, size=size, device=state.device)
+    model = DepthModel.from_pretrained(base, revision=revision, size=size, kind=kind, device=state.device)
     folder = Path(proxies_dir or default_proxies_dir(dataset_path, identity)) / identity
-    command = proxies_command(base, dataset_path, "x".join(map(str, model.size)), proxies_dir, revision)
+    place = (base, dataset_path, "x".join(map(str, model.size)), proxies_dir, revision)
+    command = proxies_command(*place)
     header = make_header(identity, pinned, model.size, pixel_settings(model.processor))
+    surface_header, surface_command = {}, ""
+    if surface is not None:
+        surface_header = header | surface.header() | {"kind": model.known_kind()}
+        surface_command = proxies_command(*place, surface) + (f" --kind {kind}" if kind else "")
+
+    def make(row: GroupPictures, path: Path) -> None:
+        if surface is not None and row.group_id.endswith(SURFACE_SUFFIX):
+            raise ValueError(f"group {row.group_id}: rename it; so the surface targets of another group are called")
+        expected = header | (pixels := picture_digests(row))
+        if (overwrite and surface is None) or not _is_current(path, expected, row.names, command, "proxy"):
+            write_proxies(path, expected, *_predict_row(model, row, batch_size))
+        if surface is None:
+            return
+        target_path = path.with_name(f"{row.group_id}{SURFACE_SUFFIX}.safetensors")
+        expected = surface_header | pixels | mask_digests(row)
+        if overwrite or not _is_current(target_path, expected, row.names, surface_command, "surface target"):
+            proxies, _ = ProxyStore(str(path.parent), header, command).read(row.group_id, row.names, pixels)
+            write_surface(target_path, expected, *_surface_row(model, row, proxies, surface, batch_size))
+
+    what = "proxies" if surface is None else "surface targets"
     problem = None
     try:
         for split in splits or gift_i_splits(dataset_path):
             dataset = parsed(load_gift_i(dataset_path, split))
             mine = range(state.process_index, len(dataset), state.num_processes)
-            for index in tqdm(
-                mine, desc=f"proxies, {split}", unit="group", delay=2, disable=not state.is_main_process
-            ):
+            for index in tqdm(mine, desc=f"{what}, {split}", unit="group", delay=2, disable=not state.is_main_process):
                 row = dataset[index]
-                path = folder / split / f"{row.group_id}.safetensors"
-                expected = header | picture_digests(row)
-                if overwrite or not _is_current(path, expected, row.names, command):
-                    write_proxies(path, expected, *_predict_row(model, row, batch_size))
+                make(row, folder / split / f"{row.group_id}.safetensors")
     except (ValueError, OSError) as error:
         problem = error
     _raise_everywhere(problem, state)
     return folder
 
 
-def _is_current(path: Path, expected: dict, names: Sequence[str], command: str) -> bool:
-    """Whether a group's proxies exist and hold; ValueError if they exist and do not."""
+def _is_current(path: Path, expected: dict, names: Sequence[str], command: str, what: str) -> bool:
+    """Whether a group's proxies, or surface targets, exist and hold; ValueError if they exist and do not."""
     if not path.exists():
         return False
-    reason = difference(read_header(path, command), expected, names)
+    reason = difference(read_header(path, command, what), expected, names)
     if reason:
-        raise ValueError(f"stale proxy {path}: {reason}; make it again with `{command} --overwrite`")
+        raise ValueError(f"stale {what} {path}: {reason}; make it again with `{command} --overwrite`")
     return True
 
 
@@ -112,9 +142,61 @@ def _predict_row(model: DepthModel, row: GroupPictures, batch_size: int):
     for name, proxy in [*zip(names, proxies, strict=True), ("the reference", reference)]:
         if proxy is not None and tuple(proxy.shape) != model.size:
             raise ValueError(f"the model predicts {tuple(proxy.shape)} for images of {model.size}; they must be equal")
-        if proxy is not None and not torch.isfinite(proxy).all():
-            raise ValueError(f"group {row.group_id}, {name}: the teacher's prediction has NaN or infinite values")
+        if proxy is not None:
+            _require_finite(proxy, row, name)
     return proxies, reference
+
+
+def _require_finite(prediction: torch.Tensor, row: GroupPictures, name: str) -> None:
+    if not torch.isfinite(prediction).all():
+        raise ValueError(f"group {row.group_id}, {name}: the teacher's prediction has NaN or infinite values")
+
+
+def _surface_row(
+    model: DepthModel, row: GroupPictures, proxies: torch.Tensor, settings: SurfaceSettings, batch_size: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(target, target_flipped), each (N, h, w), of one row and its proxies; ValueError naming the group.
+
+    A row without a pixel to teach at this size keeps its own predictions. Flipped are the pixels that the network
+    takes, as training does it: what a resized photo's mirror image shows may differ by rounding.
+    """
+    masks = np.stack([resize_mask(mask, model.size) for mask in row.masks])
+    valids = np.stack([resize_mask(valid, model.size) for valid in row.valids]) if row.valids else None
+    flipped = model.predict(model.inputs(row.images).flip(-1), batch_size)
+    if not (masks if valids is None else masks & valids).any():
+        return proxies, flipped
+    fills: list[torch.Tensor] = []
+    fills_flipped: list[torch.Tensor] = []
+    for name, image, mask, mirrored in zip(row.names, row.images, row.masks, flipped, strict=True):
+        _require_finite(mirrored, row, f"{name} flipped")
+        painted = paint_fills(np.asarray(image), mask, settings.fills, settings.seed)
+        if settings.fills:
+            pixels = torch.cat([model.inputs([Image.fromarray(fill)]) for fill in painted])
+            fills.append(model.predict(pixels, batch_size))
+            fills_flipped.append(model.predict(pixels.flip(-1), batch_size))
+            _require_finite(torch.stack([fills[-1], fills_flipped[-1]]), row, f"a fill of {name}")
+
+    def surface(own: torch.Tensor, painted: list[torch.Tensor], turn: slice) -> torch.Tensor:
+        found = surface_target(
+            own.numpy(),
+            masks[:, :, turn],
+            row.surface,
+            torch.stack(painted).numpy() if painted else None,
+            model.known_kind(),
+            None if valids is None else valids[:, :, turn],
+            settings.surface_model,
+            settings.surface_quantile,
+            settings.surface_tau,
+        )
+        target = torch.from_numpy(found.depth).float()
+        if not target.isfinite().all():
+            raise ValueError("the surface target has NaN or infinite values")
+        return target
+
+    try:
+        return surface(proxies, fills, slice(None)), surface(flipped, fills_flipped, slice(None, None, -1))
+    except ValueError as error:
+        raise ValueError(f"group {row.group_id}: {error}") from None
 
 
 def _raise_everywhere(problem: Exception | None, state) -> None:

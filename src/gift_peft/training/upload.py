@@ -5,7 +5,6 @@ The record holds no path of this machine; a local base or dataset appears by its
 """
 
 import platform
-from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -16,11 +15,12 @@ from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 
 # And all that a resumed run may not change.
 RECORDED = ("model_revision", "dataset_name", "num_train_epochs", "max_steps", "retain")
+RECORDED += ("per_device_train_batch_size", "gradient_accumulation_steps")
 
 
 def run_record(args: GiftTrainingArguments, **about) -> dict:
     """What was run, for gift.json: arguments, versions, kind of machine, and `about` (size, metrics, fingerprint)."""
-    arguments = {k: v for k, v in asdict(args).items() if k in RECORDED or k not in FREE_TO_CHANGE}
+    arguments = {k: v for k, v in args.values().items() if k in RECORDED or k not in FREE_TO_CHANGE}
     arguments = {k: v for k, v in arguments.items() if v is not None and v != []}
     for name in ("model_name_or_path", "dataset_name"):
         arguments[name] = portable_name(arguments[name])

@@ -12,6 +12,7 @@ from gift_peft.options import package_version, run_verb
 VERBS = {
     "demo": ("demo.demo_verb", "train and evaluate the embedded model on the embedded groups"),
     "prepare": ("prepare.prepare_verb", "from a folder of photos to a checked dataset, with a report"),
+    "synthesize": ("prepare.synthesize_verb", "groups from single photos: painted copies of each"),
     "export": ("dataset.export_verb", "a dataset as parquet shards with a card, to share or stream"),
     "proxies": ("training.proxies_verb", "keep the frozen model's predictions for a dataset"),
     "train": ("training.__main__", "fine-tune a model on groups of images into an adapter"),
@@ -38,7 +39,9 @@ def _parser() -> argparse.ArgumentParser:
         epilog="example: gift-peft demo --out demo; `gift-peft VERB --help` has an example of each verb",
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action=_Version, help="print the versions of gift-peft and what it stands on")
+    parser.add_argument(
+        "-V", "--version", action=_Version, help="print the versions of gift-peft and what it stands on"
+    )
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for verb, (_, text) in VERBS.items():
         verbs.add_parser(verb, help=text, add_help=False)

@@ -6,6 +6,7 @@ code. Only the standard library is imported here: `--help` waits for nothing els
 
 import argparse
 import copy
+import math
 import os
 import sys
 import warnings
@@ -83,6 +84,21 @@ def add_adapter(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--adapter", metavar="ID", help="adapter: hub id or folder")
     parser.add_argument("--adapter-scale", type=float, metavar="S", help="0 is the base, 1 the adapter")
     parser.add_argument("--kind", choices=["depth", "inverse_depth"], help="what is predicted, if no recipe says it")
+
+
+def number(kind: type, least: int) -> Callable[[str], float]:
+    """An option's `type`: a finite number of this kind, at least `least`."""
+
+    def parse(text: str):
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value < math.inf:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a {kind.__name__} of at least {least}")
+        return value
+
+    return parse
 
 
 def use_color() -> bool:

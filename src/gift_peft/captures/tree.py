@@ -2,8 +2,9 @@
 
 `RAW[/train|/validation]/<group>/` holds the observations, in folders of their own if need be, their masks in any form
 that `masks.py` reads, perhaps the treated reference (`reference.*`, `ref.*`, `ref_*`) and `group.yaml` (`surface`,
-`notes`, `mask_class`, `static_rig`). Without split folders, groups with a reference are validation and the others
-train. `GiftI` reads it as it is; `gift-peft prepare` makes a prepared folder of it.
+`notes`, `mask_class`, `static_rig`; `synthesized` marks what `gift-peft synthesize` made). Without split folders,
+groups with a reference are validation and the others train. `GiftI` reads it as it is; `gift-peft prepare` makes a
+prepared folder of it.
 """
 
 import io
@@ -23,7 +24,7 @@ from gift_peft.rules import SPLITS, SURFACES, GroupPictures, check_count
 
 logger = logging.getLogger(__name__)
 
-GROUP_KEYS = {"surface", "notes", "mask_class", "static_rig"}
+GROUP_KEYS = {"surface", "notes", "mask_class", "static_rig", "synthesized"}
 NOT_PHOTOS = {"valids", "depths", "proxies", "masks_proposed"}  # folders of a group that hold something else
 REFERENCE = re.compile(r"ref(erence)?([^a-z].*)?", re.IGNORECASE)  # but not reflection_1
 
@@ -119,7 +120,8 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
     """The files of one group, their masks found; no picture is decoded.
 
     Raises FileNotFoundError, ValueError or another OSError naming the file: no images, names that clash, two
-    references, links in a loop, an unreadable folder, a damaged `group.yaml` or mask file.
+    references, links in a loop, an unreadable folder, a damaged `group.yaml` or mask file, painted copies as
+    validation.
     """
     pictures = _pictures(folder)
     references = [path for path in pictures if _is_reference(path)]
@@ -135,6 +137,8 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
                 f"{path} and {by_stem[path.with_suffix('')].name} would share one mask; rename one of them"
             )
     facts = _facts(folder)
+    if split == "validation" and "synthesized" in facts:
+        raise ValueError(f"group {folder}: painted copies of one photo (gift-peft synthesize) are for training only")
     masks = [find_mask(path, folder, root, facts.get("mask_class")) for path in images]
     return Capture(folder, folder.name, split, images, masks, references[0] if references else None, facts)
 
@@ -264,6 +268,8 @@ def _facts(folder: Path) -> dict:
         raise ValueError(f"{path}: mask_class {classes!r}; it is the target's value or label in the masks, or a list")
     if not isinstance(facts.get("static_rig", False), bool):
         raise ValueError(f"{path}: static_rig {facts['static_rig']!r}; it is true or false")
+    if not isinstance(facts.get("synthesized", {}), dict):
+        raise ValueError(f"{path}: synthesized {facts['synthesized']!r}; it is what gift-peft synthesize wrote there")
     return facts
 
 

@@ -100,7 +100,7 @@ def prepare_group(job: Job) -> Outcome:
         check_group_id(job.group_id)
         capture = job.read()
         list_frames(capture, job, entry)
-        digest = capture_digest(capture, job.settings)
+        digest = capture_digest(capture, asdict(job.settings))
         if digest != job.known:
             row = _make(capture, job, entry)
     except Rejection as rejection:

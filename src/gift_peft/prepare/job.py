@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from gift_peft.captures.tree import Capture, read_capture
@@ -58,9 +58,9 @@ class Outcome:
     row: dict | None = None
 
 
-def capture_digest(capture: Capture, settings: PrepareSettings) -> str:
-    """Of the content of every file that decides what becomes of the group, and of the settings."""
-    stated = json.dumps([FORMAT, capture.split, asdict(settings)], sort_keys=True)
+def capture_digest(capture: Capture, choices: dict) -> str:
+    """Of the content of every file that decides what becomes of the group, and of what was chosen to do with it."""
+    stated = json.dumps([FORMAT, capture.split, choices], sort_keys=True)
     digest = hashlib.blake2b(stated.encode(), digest_size=16)
     files = [*capture.images, capture.folder / "group.yaml"]
     files += [path for mask in capture.masks if mask is not None for path in mask.files]

@@ -8,18 +8,13 @@ import json
 import os
 import platform
 import shutil
-from collections.abc import Collection, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Collection
 from dataclasses import asdict, replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
 import numpy as np
 import PIL
-from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from gift_peft.captures.tree import find_groups
@@ -29,6 +24,7 @@ from gift_peft.options import package_version
 from gift_peft.prepare.entries import Statistics
 from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import FORMAT, Job, Outcome
+from gift_peft.prepare.out_folder import alone, check_places, side_by_side
 from gift_peft.prepare.page import write_html
 from gift_peft.prepare.settings import PrepareSettings
 from gift_peft.rules import SPLITS
@@ -66,12 +62,12 @@ def prepare_gift_i(
     settings = settings or PrepareSettings()
     if num_proc < 1:
         raise ValueError(f"num_proc: at least 1, got {num_proc}")
-    _check_places(raw, out)
+    check_places("prepare", raw, "RAW", out, STATE)
     groups = settings.layout.find(raw) if settings.layout is not None else find_groups(raw)
     staging = out / STATE / "staging"
     jobs = [Job(raw, staging, source, split, settings) for split in SPLITS for source in groups.get(split, [])]
     _check_names(jobs)
-    with _alone(out):
+    with alone("prepare", out, STATE):
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir()
         report, rows = _make_groups(raw, out, settings, jobs, num_proc)
@@ -86,17 +82,6 @@ def prepare_gift_i(
     return report
 
 
-@contextmanager
-def _alone(out: Path) -> Iterator[None]:
-    """One run at a time in OUT; the system lifts the lock of a run that was killed."""
-    (out / STATE).mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(out / STATE / "lock", timeout=0):
-            yield
-    except Timeout:
-        raise ValueError(f"OUT {out}: another gift-peft prepare is at work there; wait for it") from None
-
-
 def _make_groups(
     raw: Path, out: Path, settings: PrepareSettings, jobs: list[Job], num_proc: int
 ) -> tuple[dict, dict[str, dict[str, dict]]]:
@@ -107,7 +92,7 @@ def _make_groups(
     write_rows(_rows(kept, jobs), out)
     jobs = [replace(job, known=(records[job.split, job.group_id] or {}).get("digest")) for job in jobs]
     with tqdm(total=len(jobs), desc="groups", unit="group", disable=None) as bar:
-        for job, outcome in _run(jobs, num_proc):
+        for job, outcome in side_by_side("prepare", prepare_group, jobs, num_proc):
             if outcome.digest is None or outcome.digest != job.known:
                 key = job.split, job.group_id
                 if kept.pop(key, None):  # first the table, then the files: the table never names what is not there
@@ -122,18 +107,6 @@ def _make_groups(
     return _report(raw, out, settings, entries, removed), _rows(kept, jobs)
 
 
-def _check_places(raw: Path, out: Path) -> None:
-    if not raw.is_dir():
-        raise FileNotFoundError(f"RAW {raw}: no such folder")
-    there, here = raw.resolve(), out.resolve()
-    if here == there or here.is_relative_to(there) or there.is_relative_to(here):
-        raise ValueError(f"OUT {out}: it must lie neither inside RAW nor around it; RAW is left as it is")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"OUT {out}: not a folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / STATE).is_dir():
-        raise ValueError(f"OUT {out}: not empty, and not made by gift-peft prepare; name a new folder")
-
-
 def _check_names(jobs: list[Job]) -> None:
     seen: dict[tuple[str, str], Job] = {}
     for job in jobs:
@@ -141,31 +114,6 @@ def _check_names(jobs: list[Job]) -> None:
         other = seen.setdefault((job.split, job.group_id.casefold()), job)
         if other is not job:
             raise ValueError(f"{job.folder} and {other.folder}: two groups with one name; rename one")
-
-
-def _run(jobs: list[Job], num_proc: int) -> Iterator[tuple[Job, Outcome]]:
-    """Every job with its outcome, as they finish."""
-    if num_proc == 1 or len(jobs) < 2:
-        threads = cv2.getNumThreads()
-        try:
-            for job in jobs:
-                yield job, prepare_group(job)
-        finally:
-            cv2.setNumThreads(threads)
-        return
-    # Started anew, not forked: OpenCV's and torch's threads do not survive a fork.
-    pool = ProcessPoolExecutor(min(num_proc, len(jobs)), mp_context=get_context("spawn"))
-    try:
-        futures = {pool.submit(prepare_group, job): job for job in jobs}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    except BrokenProcessPool:
-        raise OSError(
-            "a process of gift-peft prepare was killed, perhaps for memory, or could not start because the calling "
-            'script has no `if __name__ == "__main__":`; finished groups are kept, run again with fewer (--num-proc)'
-        ) from None
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 # ---- what is in OUT ----

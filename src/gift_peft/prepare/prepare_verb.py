@@ -5,15 +5,14 @@ A YAML file (`--config`) may state the same names; the command line wins.
 
 import argparse
 import difflib
-import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import Field, fields
 from pathlib import Path
 
 from gift_peft.captures.foreign import read_layout
 from gift_peft.files import read_yaml
-from gift_peft.options import OptionParser
+from gift_peft.options import OptionParser, number
 from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
 
 PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
@@ -74,9 +73,7 @@ def make_parser() -> OptionParser:
     parser.add_argument("raw", metavar="RAW", help="folder of group folders; it is only read")
     parser.add_argument("out", metavar="OUT", help="prepared folder: new, or made by this command before")
     parser.add_argument("--config", metavar="FILE", help="YAML file with values for the options below")
-    parser.add_argument(
-        "--num-proc", type=_number(int, 1), default=1, metavar="N", help="groups prepared side by side"
-    )
+    parser.add_argument("--num-proc", type=number(int, 1), default=1, metavar="N", help="groups prepared side by side")
     parser.add_argument("--license", default="unknown", metavar="ID", help="for the dataset card, as cc-by-4.0")
     parser.add_argument("--pretty-name", metavar="NAME", help="for the dataset card; default: the name of RAW")
     for kind in (PrepareSettings, *PARTS.values()):
@@ -86,7 +83,7 @@ def make_parser() -> OptionParser:
             if isinstance(option.default, bool):
                 form = {"action": argparse.BooleanOptionalAction}
             elif option.default is not None:
-                form["type"] = _number(type(option.default), option.metadata["least"])
+                form["type"] = number(type(option.default), option.metadata["least"])
             spelling = f"--{name.replace('_', '-')}"
             group.add_argument(spelling, default=option.default, help=option.metadata["help"], **form)
     return parser
@@ -94,19 +91,6 @@ def make_parser() -> OptionParser:
 
 def _options(kind: type) -> dict[str, Field]:
     return {option.name: option for option in fields(kind) if option.metadata}
-
-
-def _number(kind: type, least: int) -> Callable[[str], float]:
-    def parse(text: str):
-        try:
-            value = kind(text)
-        except ValueError:
-            value = math.nan
-        if not least <= value < math.inf:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a {kind.__name__} of at least {least}")
-        return value
-
-    return parse
 
 
 def _read_config(path: Path) -> list[str]:

@@ -31,9 +31,9 @@ PAGE = """<!doctype html>
   body {{ margin: 0 auto; max-width: 86rem; padding: 1rem; }}
   h2 {{ font-size: 1.05rem; margin: 1.5rem 0 0; overflow-wrap: anywhere; }}
   p {{ margin: .2rem 0 .5rem; }}
-  div {{ display: flex; flex-wrap: wrap; gap: .75rem; }}
+  div {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(15rem, 1fr)); gap: .75rem; }}
   figure {{ margin: 0; }}
-  img {{ display: block; height: auto; max-width: 100%; }}
+  img {{ display: block; height: auto; width: 100%; }}
 </style></head><body>
 <h1>Surface targets</h1>
 <p>Inside the outlined target, training pulls the base's prediction to the surface target; outside both are the same.

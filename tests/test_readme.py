@@ -61,7 +61,7 @@ def only_parsed(command: str) -> bool:
 
 
 @pytest.fixture
-def workplace(tmp_path, monkeypatch):
+def workspace(tmp_path, monkeypatch):
     """A folder as after `gift-peft demo`, with photos and captures of one's own, and a Booster."""
     with pytest.warns(UserWarning, match="the base is the local folder"):
         write_demo(tmp_path / "demo")
@@ -90,7 +90,7 @@ def test_no_reason_is_left_over():
 
 @pytest.mark.filterwarnings("ignore:the base is the local folder", "ignore:.*booster:UserWarning")
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_commands_run(page, workplace):
+def test_commands_run(page, workspace):
     """In the order of the page; what the README shows before it may be taken as done."""
     todo = [command for command in commands(page) if command not in IN_CI and not only_parsed(command)]
     for folder, command in NEEDED.items():
@@ -144,7 +144,7 @@ def launched(words: list[str]) -> list[str]:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
-def test_python_blocks(page, workplace):
+def test_python_blocks(page, workspace):
     names = {"pixel_values": torch.zeros(1, 3, *SIZE)}
     for block in blocks(page, "python"):
         exec(block, names)

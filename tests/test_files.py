@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,18 @@ def test_a_folder_replaces_the_earlier_one_and_what_a_killed_writer_left(tmp_pat
     with whole_folder(target) as folder:
         (folder / "fresh").write_text("")
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["target", "target/fresh"]
+
+
+def test_a_folder_is_never_seen_half_deleted(tmp_path, monkeypatch):
+    from gift_peft.files import remove_folder
+
+    for name in ("target", ".target.tmp"):  # the second as a killed run left it
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a").write_text(name)
+    seen, real = [], shutil.rmtree
+    monkeypatch.setattr(shutil, "rmtree", lambda path, **options: seen.append(path.name) or real(path, **options))
+    remove_folder(tmp_path / "target")
+    assert seen == [".target.tmp", ".target.tmp"] and not list(tmp_path.iterdir())
 
 
 def test_a_file_stands_in_the_way_of_a_folder(tmp_path):

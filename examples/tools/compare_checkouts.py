@@ -1,8 +1,8 @@
 """Do two checkouts compute the same bits? Runs the demo of each at seed 0 on one thread and compares what they leave.
 
-    git worktree add /tmp/before v0.1.0
-    python examples/tools/compare_checkouts.py /tmp/before .                      # the whole demo: minutes for each
-    python examples/tools/compare_checkouts.py /tmp/before . -- --max_steps 20    # a quick look
+    git worktree add ../before v0.1.0
+    python examples/tools/compare_checkouts.py ../before .                        # the whole demo: minutes for each
+    python examples/tools/compare_checkouts.py ../before . -- --max_steps 20      # a quick look
 
 Compared byte for byte: adapters, proxies, metrics.jsonl, the rows of both evaluations and of a third one under the
 protocol depth4tom. Both run in this environment, with the package of their own `src`. Exit code 1 if anything differs.

@@ -70,6 +70,14 @@ def whole_folder(target: Path) -> Iterator[Path]:
     shutil.rmtree(old, ignore_errors=True)
 
 
+def remove_folder(folder: Path) -> None:
+    """Delete a folder so that it is never seen half deleted: first its name goes, as `.<name>.tmp`, then its files."""
+    gone = folder.with_name(f".{folder.name}.tmp")
+    shutil.rmtree(gone, ignore_errors=True)
+    os.replace(folder, gone)
+    shutil.rmtree(gone)
+
+
 def read_yaml(path: Path, name: str | None = None) -> dict:
     """The mapping in a YAML file, {} for an empty one; `name` is how messages call the file, default its path.
 

@@ -4,12 +4,14 @@ The same rules serve every reader: pictures come upright and in 8-bit RGB, masks
 so in one line that names the file.
 """
 
+import base64
 import hashlib
 import io
 import re
 import struct
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -99,6 +101,13 @@ def image_digest(image: Image.Image) -> str:
     digest = hashlib.blake2b(f"{image.mode} {image.width}x{image.height} ".encode(), digest_size=16)
     digest.update(image.tobytes())
     return digest.hexdigest()
+
+
+def jpeg_uri(image: Image.Image, **options: Any) -> str:
+    """An RGB picture as a JPEG inside its own address, for pages of one file; `options` as Pillow saves it."""
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", **options)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def natural_key(name: str) -> list:

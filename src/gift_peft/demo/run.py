@@ -6,7 +6,6 @@ depth, and the base was pre-trained on rooms without a mirror or glass (`example
 
 import os
 import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.resources import as_file, files
@@ -20,6 +19,7 @@ from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.tables import markdown_table, text_table
 from gift_peft.files import whole_folder, write_whole
 from gift_peft.models.loading import DepthModel
+from gift_peft.options import use_color
 from gift_peft.reports.figures import before_after
 from gift_peft.reports.model_card import run_length
 from gift_peft.reports.panels import group_panels
@@ -161,12 +161,11 @@ RMSE inside the target, per kind (mm):
 
 
 def _print_summary(reports: dict[str, Report], out: Path) -> None:
-    color = sys.stdout.isatty() and "NO_COLOR" not in os.environ
     for reference, title in (
         ("proxy", "Against the base's prediction on the treated reference"),
         ("depth", "Against true depth"),
     ):
-        print(f"\n{title}\n{text_table(reports[reference], color=color)}")
+        print(f"\n{title}\n{text_table(reports[reference], color=use_color())}")
     print("\nRMSE inside the target against true depth, per kind of target (mm)")
     for label, base, adapted in _by_kind(reports["depth"]):
         print(f"  {label:12} {base:7.0f} -> {adapted:7.0f}  ({100 * (adapted / base - 1):+.1f} %)")

@@ -3,15 +3,13 @@
 One file without scripts or links: the groups themselves are parquet shards, which no picture viewer opens.
 """
 
-import base64
 import html
-import io
 from collections.abc import Iterable
 
 import numpy as np
 from PIL import Image
 
-from gift_peft.reports.figures import outline
+from gift_peft.reports.figures import html_figure, outline
 from gift_peft.rules import GroupPictures
 
 ENLARGE = 2  # the pictures are small; the outline stays a line
@@ -52,9 +50,4 @@ def _figure(caption: str, image: Image.Image, mask: np.ndarray | None = None) ->
     image = image.resize((ENLARGE * image.width, ENLARGE * image.height), Image.Resampling.BICUBIC)
     if mask is not None:
         image = Image.fromarray(outline(np.asarray(image), mask))
-    stream = io.BytesIO()
-    image.save(stream, "JPEG", quality=90)
-    source = "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode()
-    size = f'width="{image.width}" height="{image.height}"'
-    caption = html.escape(caption)
-    return f'<figure><img src="{source}" {size} alt="{caption}"><figcaption>{caption}</figcaption></figure>\n'
+    return html_figure(caption, image, quality=90)

@@ -5,9 +5,7 @@ flicker box of a group lets its frames alternate with the one they were register
 at once; a warped frame is shown before and after, with its differences from that frame.
 """
 
-import base64
 import html
-import io
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,7 +16,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from gift_peft.files import write_whole
-from gift_peft.images import open_image
+from gift_peft.images import jpeg_uri, open_image
 
 WIDTH = 240  # of the thumbnails, in pixels
 AMPLIFY = 4  # of the differences
@@ -148,7 +146,7 @@ def _group(index: int, group: dict, out: Path, raw: Path, bar: tqdm) -> str:
     frames = group["frames"]
     target = next((frame for frame in frames if frame["name"] == group["target_frame"]), None)
     target_image = None if target is None else _picture(target, out, raw)
-    style = f' style="--target:url({_uri(target_image)})"' if target_image is not None else ""
+    style = f' style="--target:url({jpeg_uri(target_image, quality=75)})"' if target_image is not None else ""
     proposal = group.get("proposal")
     size = group.get("size")
     facts = [group["split"], group.get("surface"), f"{size[0]}×{size[1]}" if size else None, group.get("notes")]
@@ -265,14 +263,8 @@ def _shot(image: Image.Image | None, label: str, blink: str = "", outlines: Iter
     overlay = f'<svg viewBox="0 0 1 1" preserveAspectRatio="none">{paths}</svg>' if paths else ""
     caption = f"<span>{_text(label)}</span>" if label else ""
     size = f'width="{image.width}" height="{image.height}"'
-    picture = f'<img src="{_uri(image)}" {size} alt="{_text(label)}">'
+    picture = f'<img src="{jpeg_uri(image, quality=75)}" {size} alt="{_text(label)}">'
     return f'<div class="shot{blink}">{picture}{overlay}{caption}</div>'
-
-
-def _uri(image: Image.Image) -> str:
-    buffer = io.BytesIO()
-    image.save(buffer, "JPEG", quality=75)
-    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
 def _proposed(frame: dict, group: dict) -> str | None:

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from gift_peft.captures.masks import is_mask_file
 from gift_peft.captures.tree import Capture, check_masks, find_groups, read_capture
-from gift_peft.files import read_yaml, whole_folder, write_whole
+from gift_peft.files import read_yaml, remove_folder, whole_folder, write_whole
 from gift_peft.images import image_digest, is_image_file, read_image
 from gift_peft.prepare.job import capture_digest, printable
 from gift_peft.prepare.out_folder import alone, check_places, side_by_side
@@ -213,8 +213,8 @@ def _make_group(job: _Job) -> _Outcome:
             return _Outcome(wrong=foreign)
         pictures, mask = _paint(job)
     except (OSError, ValueError, cv2.error, MemoryError, RecursionError) as error:
-        if foreign is None:  # what an earlier run made of this photo is no longer right
-            _remove(job.folder)
+        if foreign is None and job.folder.exists():  # what an earlier run made of this photo is no longer right
+            remove_folder(job.folder)
         return _Outcome(wrong=" ".join(str(error).split()) or type(error).__name__)
     known = {key: value for key, value in job.capture.facts.items() if key in ("surface", "notes")}
     facts = {**known, "static_rig": True, MARK: {**mark, "digest": digest}}
@@ -302,17 +302,8 @@ def _tidy(train: Path, wanted: Collection[str], report: SynthesisReport) -> None
         if (foreign := _foreign(folder)) is not None:
             report.rejected[f"train/{folder.name}"] = f"its photo is gone; {foreign}"
             continue
-        _remove(folder)
+        remove_folder(folder)
         report.removed.append(folder.name)
-
-
-def _remove(folder: Path) -> None:
-    """As a whole: first the name, then the files."""
-    if folder.exists():
-        old = folder.with_name(f".{folder.name}.old")
-        shutil.rmtree(old, ignore_errors=True)
-        os.replace(folder, old)
-        shutil.rmtree(old, ignore_errors=True)
 
 
 def _write_card(photos: Path, out: Path, groups: int, fills: int) -> None:

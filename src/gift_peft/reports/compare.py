@@ -1,7 +1,5 @@
 """`compare.html`: base and adapted depth of an image under a slider. One file that needs no network and no server."""
 
-import base64
-import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -10,6 +8,7 @@ import numpy as np
 from PIL import Image
 
 from gift_peft.files import write_whole
+from gift_peft.images import jpeg_uri
 from gift_peft.reports.figures import GridRow, Panel, outline, panel_row
 
 TEMPLATE = Path(__file__).parent / "templates" / "compare.html"
@@ -46,7 +45,6 @@ def _pictures(row: GridRow) -> list[str]:
     sources = []
     for tile in row.tiles:
         image = Image.fromarray(tile).resize((factor * width, factor * height), Image.Resampling.BICUBIC)
-        stream = io.BytesIO()
-        Image.fromarray(outline(np.asarray(image), row.target)).save(stream, "JPEG", quality=92, subsampling=0)
-        sources.append("data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode())
+        outlined = Image.fromarray(outline(np.asarray(image), row.target))
+        sources.append(jpeg_uri(outlined, quality=92, subsampling=0))
     return sources

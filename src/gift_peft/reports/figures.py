@@ -4,6 +4,7 @@ A figure is a grid of colour tiles (paper, qualitative figures and supplement C)
 the target outlined, unknown pixels grey in the reference and nowhere else. Pillow draws it once, for PNG and for PDF.
 """
 
+import html
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from gift_peft.evaluation.alignment import align, known
 from gift_peft.evaluation.metrics import depth_metrics
 from gift_peft.evaluation.protocols import get_protocol
 from gift_peft.files import write_whole
+from gift_peft.images import jpeg_uri
 
 TILE_WIDTH, GAP, HEADER, CAPTION = 512, 12, 54, 48  # pixels; text of 9 and 7 points in print
 # How Pillow saves it. No dates in a PDF: the same panels give the same bytes.
@@ -205,6 +207,13 @@ def _write(canvas: Image.Image, at: tuple[int, int], text: str, size: int, room:
         size -= 1
         font = ImageFont.load_default(size)
     ImageDraw.Draw(canvas).text(at, text, fill="black", font=font, anchor=anchor)
+
+
+def html_figure(caption: str, picture: Image.Image, quality: int) -> str:
+    """A picture with its caption for a page of one file; `quality` of the JPEG."""
+    size, caption = f'width="{picture.width}" height="{picture.height}"', html.escape(caption)
+    source = jpeg_uri(picture, quality=quality)
+    return f'<figure><img src="{source}" {size} alt="{caption}"><figcaption>{caption}</figcaption></figure>\n'
 
 
 def outline(tile: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -4,10 +4,8 @@ Per observation the photo, the base's prediction, the surface target and, where 
 treated reference, in the same colors; the largest differences come first. One file without scripts or links.
 """
 
-import base64
 import heapq
 import html
-import io
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -17,7 +15,7 @@ from PIL import Image
 from gift_peft.colormap import color_range, colorize
 from gift_peft.evaluation.alignment import align
 from gift_peft.models.pixels import resize_mask
-from gift_peft.reports.figures import outline
+from gift_peft.reports.figures import html_figure, outline
 from gift_peft.rules import GroupPictures
 
 WIDTH = 320  # of a picture
@@ -96,18 +94,12 @@ def _shown(group: GroupPictures, index: int, kind: str) -> Shown:
     low, high = color_range(*(values[valid] for values in maps.values()))
     height = round(WIDTH * base.shape[0] / base.shape[1])
     photo = group.images[index].convert("RGB").resize((WIDTH, height), Image.Resampling.BICUBIC)
-    figures = [_figure(group.names[index], outline(np.asarray(photo), mask))]
+    pictures = {group.names[index]: photo}
     for name, values in maps.items():
-        picture = Image.fromarray(colorize(values, low, high, kind)).resize((WIDTH, height))
-        figures.append(_figure(name, outline(np.asarray(picture), mask)))
+        pictures[name] = Image.fromarray(colorize(values, low, high, kind)).resize((WIDTH, height))
+    figures = [
+        html_figure(name, Image.fromarray(outline(np.asarray(picture), mask)), quality=85)
+        for name, picture in pictures.items()
+    ]
     title = html.escape(", ".join(filter(None, (f"{group.group_id}/{group.names[index]}", group.surface))))
     return Shown(difference, f"<h2>{title}</h2>\n<p>{told}</p>\n<div>{''.join(figures)}</div>")
-
-
-def _figure(caption: str, pixels: np.ndarray) -> str:
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "JPEG", quality=85)
-    source = "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode()
-    size = f'width="{pixels.shape[1]}" height="{pixels.shape[0]}"'
-    caption = html.escape(caption)
-    return f'<figure><img src="{source}" {size} alt="{caption}"><figcaption>{caption}</figcaption></figure>\n'

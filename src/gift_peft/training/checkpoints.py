@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save_file
 
 from gift_peft.adapters.folder import ADAPTER_WEIGHTS
 from gift_peft.dataset.gift_i import dataset_fingerprint
-from gift_peft.files import jsonable, reason, whole_folder, write_whole
+from gift_peft.files import jsonable, reason, remove_folder, whole_folder, write_whole
 from gift_peft.models.identity import teacher_revision
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
 
@@ -263,10 +263,7 @@ def prune_checkpoints(output_dir: Path, step: int, limit: int | None, keep: list
     """
     found = [f for f in list_checkpoints(output_dir) if _step(f) <= step and _step(f) not in keep]
     for folder in found[: -limit if limit else 0]:
-        # Renamed first: a half-deleted folder must not look like a damaged checkpoint.
-        gone = folder.with_name(f".{folder.name}.tmp")
-        os.replace(folder, gone)
-        shutil.rmtree(gone)
+        remove_folder(folder)
 
 
 @contextmanager

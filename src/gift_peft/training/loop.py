@@ -186,9 +186,11 @@ def _groups(
     surface = args.surface_settings() if args.target == "surface" else None
     try:
         make = partial(make_proxies, args.model_name_or_path, args.dataset_name, accelerator=accelerator, **places)
-        make()
-        if surface is not None:
-            make(["train"], surface=surface, kind=args.prediction_kind)
+        if surface is None:
+            make(splits)
+        else:  # with the surface targets of a split its proxies are made too
+            for split in splits:
+                make([split], **({"surface": surface, "kind": args.prediction_kind} if split == "train" else {}))
     except PermissionError as error:
         options = ("x".join(map(str, size)), args.proxies_dir, args.model_revision, surface)
         command = proxies_command(args.model_name_or_path, args.dataset_name, *options)

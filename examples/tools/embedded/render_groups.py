@@ -342,7 +342,9 @@ def shipped(out: Path) -> list[tuple]:
             for index in range(count):
                 seed = FIRST_SEED[split] + (number * 1000 + index) * 200
                 tasks.append((out / split / f"{kind}_{index:03d}", kind, seed, False))
-    return sorted(tasks, key=lambda task: (task[0].parent.name, task[0].name.rsplit("_")[1]))  # all kinds from the start
+    return sorted(
+        tasks, key=lambda task: (task[0].parent.name, task[0].name.rsplit("_")[1])
+    )  # all kinds from the start
 
 
 def more(out: Path, first_seed: int, count: int, single: bool) -> list[tuple]:

@@ -9,6 +9,7 @@ each set; finished ones are skipped. `tables.py` reads what stands in `--out`.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import time
@@ -60,7 +61,23 @@ def target_maps(group: Observed, rule: plan.Rule, flipped: bool) -> np.ndarray:
     raise ValueError(f"unknown statistic {rule.statistic}")
 
 
-def train(trial: plan.Trial, groups: list[Observed], seed: int):
+def kept_maps(store: Path, groups: list[Observed], rule: plan.Rule, flipped: bool) -> list[torch.Tensor]:
+    """`target_maps` of all groups, float32; computed once for each rule and choice of photos."""
+    key = hashlib.blake2b(repr((rule, flipped)).encode(), digest_size=8)
+    for group in groups:
+        key.update(f"{group.name} {group.base.sum():.9e}".encode())
+    path = store / f"maps-{key.hexdigest()}.pt"
+    if not path.exists():
+        maps = [
+            torch.from_numpy(target_maps(group, rule, flipped)).float()
+            for group in tqdm(groups, f"targets, {rule.statistic}", delay=5)
+        ]
+        torch.save(maps, path.with_suffix(".part"))
+        os.replace(path.with_suffix(".part"), path)
+    return torch.load(path)
+
+
+def train(trial: plan.Trial, groups: list[Observed], seed: int, store: Path):
     """The network with its trained adapter, its image processor, and seconds of training."""
     base, processor = load_base(BASE)
     torch.manual_seed(seed)
@@ -74,7 +91,7 @@ def train(trial: plan.Trial, groups: list[Observed], seed: int):
     if trial.rule is None:
         update, feed, epoch = _consensus(network, trial, groups, inputs, seed)
     else:
-        update, feed, epoch = _surface(network, trial, groups, inputs, seed)
+        update, feed, epoch = _surface(network, trial, groups, inputs, seed, store)
     total = trial.updates or trial.epochs * epoch
     for number, item in zip(tqdm(range(total), trial.name, mininterval=20), feed, strict=False):
         optimizer.param_groups[0]["lr"] = trial.rate * (1 - number / total)
@@ -110,14 +127,11 @@ def _consensus(network, trial, groups, inputs, seed):
     return update, feed(), len(groups)
 
 
-def _surface(network, trial, groups, inputs, seed):
+def _surface(network, trial, groups, inputs, seed, store):
     step = SurfaceStep(PredictedDepth(network), trial.lambda_c, trial.lambda_d, 4)
     places = [(row, image) for row, group in enumerate(groups) for image in range(len(group.images))]
     both = [False, True] if trial.flips else [False]
-    maps = [
-        {flip: torch.from_numpy(target_maps(group, trial.rule, flip)).float() for flip in both}
-        for group in tqdm(groups, "targets", delay=5)
-    ]
+    maps = {flip: kept_maps(store, groups, trial.rule, flip) for flip in both}
 
     def feed():
         for epoch, order in _orders(len(places), seed):
@@ -131,7 +145,7 @@ def _surface(network, trial, groups, inputs, seed):
             one, mask = inputs[row][image], torch.from_numpy(groups[row].mask)
             pixels.append(one.flip(-1) if flip else one)
             masks.append(mask.flip(-1) if flip else mask)
-            wanted.append(maps[row][flip][image])
+            wanted.append(maps[flip][row][image])
         step.accumulate(torch.stack(pixels), torch.stack(masks), torch.stack(wanted))
 
     return update, feed(), -(-len(places) // trial.batch)
@@ -200,7 +214,7 @@ def run(trial: plan.Trial, seed: int, sets: dict[str, list[Observed]], out: Path
     groups = choose(groups, trial.photos)
     if trial.count:
         groups = groups[: trial.count]
-    model, seconds = train(trial, groups, seed)
+    model, seconds = train(trial, groups, seed, out)
     result = {"trial": trial.describe(), "seed": seed, "photos": sum(len(group.images) for group in groups)}
     result |= {"groups": len(groups), "train_seconds": seconds, "sets": {}}
     for name, part in trial.score:

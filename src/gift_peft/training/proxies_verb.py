@@ -49,7 +49,8 @@ def run(argv: Sequence[str]) -> int:
     settings = SurfaceSettings(**{field.name: getattr(args, field.name) for field in fields(SurfaceSettings)})
     if args.target is None and (settings != SurfaceSettings() or args.kind or args.page):
         parser.error("fills, seed, kind, page and the surface options are for --target surface")
-    from gift_peft.training.teacher import make_proxies
+    from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
+    from gift_peft.training.teacher import make_proxies, told_of_surface
 
     folder = make_proxies(
         args.base,
@@ -63,6 +64,10 @@ def run(argv: Sequence[str]) -> int:
         kind=args.kind,
     )
     print(f"{'Surface targets' if args.target else 'Proxies'}: {folder}")
+    if args.target:
+        for split in args.splits or gift_i_splits(args.dataset):
+            names = load_gift_i(args.dataset, split).select_columns(["group_id"])["group_id"]
+            print("\n".join(f"  {split}, {line}" for line in told_of_surface(folder, split, names)))
     if args.page:
         print(f"Page: {_write_page(args, settings, folder)}")
     return 0

@@ -48,23 +48,20 @@ def part(groups: list[Observed], name: str) -> list[Observed]:
     return {"all": groups, "fourth": groups[::4], "others": [g for i, g in enumerate(groups) if i % 4]}[name]
 
 
-LITE = (("lite/train", "all"),)
-OLD = (("lite/validation", "all"),)
+TRAIN = (("train", "all"),)
+OLD = (("validation", "all"),)
+FRESH = (("fresh_1", "all"), ("fresh_2", "all"), ("fresh_3", "all"))
 
 
 def first(name: str, **options) -> Trial:
-    return Trial(name, LITE, OLD, **options)
+    return Trial(name, TRAIN, OLD, **options)
 
 
 STAGES = {
     "first": [
-        first("auto"),
-        first("consensus", rule=None, lambda_c=1.0, flips=False),
-        first("auto without fills", rule=Rule(fills=0)),
-        first("auto 8 epochs", epochs=8),
-        first("plane", rule=Rule("plane")),
-        first("auto lambda_c 1.5", lambda_c=1.5),
-        first("quantile", rule=Rule("quantile")),
-        first("auto rate 4e-4", rate=4e-4),
+        first("auto lambda_c 1 8 epochs", lambda_c=1.0, epochs=8),
+        first("auto without fills lambda_c 1.2 8 epochs", rule=Rule(fills=0), lambda_c=1.2, epochs=8),
+        first("consensus 8 epochs", rule=None, lambda_c=1.0, flips=False, epochs=8),
+        first("auto 8 epochs rate 1e-4", epochs=8, rate=1e-4),
     ],
 }

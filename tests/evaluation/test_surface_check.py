@@ -1,4 +1,4 @@
-"""What is known of surface targets before training: measured errors equal an evaluation's, the rest plain statistics."""
+"""What is known of surface targets before training: errors as an evaluation has them, the rest plain statistics."""
 
 import math
 
@@ -87,8 +87,8 @@ def test_lines_per_surface_kind():
     assert lines == [
         "mirror (2 groups): error inside the target against true depth: 200 mm of the base, 100 mm of the surface "
         "target (-50 % [-50, -50])",
-        "unknown surface (1 group): 75% of the target moved nearer, by 10.0% of the prediction's range; a plane misses "
-        "them by 2.0% (no treated reference or true depth here says whether that is right)",
+        "unknown surface (1 group): 75% of the target moved nearer, by 10.0% of the prediction's range; a plane "
+        "misses them by 2.0% (no treated reference or true depth here says whether that is right)",
     ]
 
 

@@ -62,7 +62,7 @@ def args(base_dir, tree, tmp_path):
 # ---- what is computed ----
 
 
-def by_hand(model, groups, order, lambdas=(2.0, 1.0)):
+def by_hand(model, groups, order, lambdas=(1.5, 1.0)):
     """The mean loss of the images `order` lists as (index, flipped), from whole groups: straight from the formula."""
     places = [(row, image) for row in range(len(groups)) for image in range(len(groups[row].names))]
     total, terms = 0, torch.zeros(2)
@@ -140,7 +140,7 @@ def test_images_of_any_groups_make_an_update(groups):
 
 def test_the_adapter_says_what_it_was_trained_to(whole):
     record = json.loads((whole / "adapter/gift.json").read_text())
-    assert record["arguments"]["target"] == "surface" and record["arguments"]["lambda_c"] == 2.0
+    assert record["arguments"]["target"] == "surface" and record["arguments"]["lambda_c"] == 1.5
     assert record["arguments"]["fills"] == FILLS and "micro_batch_size" not in record["arguments"]
     assert record["num_groups"] == 4 and record["epoch"] in (1, 2)
     card = (whole / "adapter/README.md").read_text()
@@ -227,7 +227,7 @@ def test_targets_of_other_settings_are_refused(args):
     with pytest.raises(ValueError) as excinfo:
         train(GiftTrainingArguments(**{**vars(args), "surface_tau": 0.6}))
     message = str(excinfo.value)
-    assert "made with surface_tau 0.7, not 0.6" in message and "\n" not in message
+    assert "made with surface_tau 0.5, not 0.6" in message and "\n" not in message
     assert "--target surface" in message and "--surface_tau 0.6 --overwrite`" in message
 
 

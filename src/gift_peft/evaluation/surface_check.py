@@ -1,9 +1,9 @@
 """Whether surface targets are better than the base: measured where that can be, described where it cannot.
 
-Both are taken per observation when a group's targets are made, while its pictures are at hand, and stored in the file's
-header; what is printed before training is read from there. The measure is that of an evaluation: the base's prediction
-and the same with the surface target inside the mask are aligned to true depth, or to the teacher's prediction on the
-treated reference, and compared by the RMSE inside.
+Both are taken per observation when a group's targets are made, while its pictures are at hand, and stored in the
+file's header; what is printed before training is read from there. The measure is that of an evaluation: the base's
+prediction, and the same with the surface target inside the mask, are aligned to true depth or to the teacher's
+prediction on the treated reference, and compared by the RMSE inside.
 """
 
 import math

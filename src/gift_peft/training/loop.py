@@ -207,7 +207,9 @@ def _groups(
                     check_pair(group_id, len(names))
             if split == "train" and surface is not None:
                 told = told_of_surface(surface_folder, split, rows["group_id"])
-                accelerator.print("\n".join(["Surface targets of the training groups", *(f"  {line}" for line in told)]))
+                accelerator.print(
+                    "\n".join(["Surface targets of the training groups", *(f"  {line}" for line in told)])
+                )
             groups[split] = PreparedGroups(rows, processor, size, args.dataloader_num_workers, cache_dir)
     return groups
 

@@ -30,11 +30,12 @@ def make_parser() -> OptionParser:
         "fills": "copies of each photo with its target painted in one color; 0 is allowed",
         "seed": "of their colors",
         "surface_model": "auto: a plane where it fits, else the quantile",
-        "surface_quantile": "of inverse depth, higher is nearer",
-        "surface_tau": "share of the predictions below the plane",
+        "surface_quantile": "of inverse depth, higher is nearer; default 0.65, without fills 0.8",
+        "surface_tau": "share of the predictions below the plane; default 0.5, without fills 0.7",
     }
     for field in fields(SurfaceSettings):
-        options = {"choices": MODELS} if field.name == "surface_model" else {"type": type(field.default)}
+        kind = float if field.default is None else type(field.default)
+        options = {"choices": MODELS} if field.name == "surface_model" else {"type": kind}
         name = f"--{field.name.replace('_', '-')}"
         surface.add_argument(name, default=field.default, help=text[field.name], **options)
     text = "a page to look at: each photo, its base prediction, surface target and treated reference"

@@ -112,7 +112,7 @@ def test_the_first_row_is_the_base(whole, groups):
     ]
     row = rows_of(whole)[0]
     assert row["consistency"] == pytest.approx(sum(distances) / 7, rel=1e-5)
-    assert row["loss"] == pytest.approx(2 * row["consistency"]) and row["distillation"] == 0
+    assert row["loss"] == pytest.approx(1.5 * row["consistency"]) and row["distillation"] == 0
     assert row["train_gce"] is None and row["val_gce"] > 0
     assert list(row) == list(rows_of(whole)[2])
 
@@ -144,7 +144,7 @@ def test_the_adapter_says_what_it_was_trained_to(whole):
     assert record["arguments"]["fills"] == FILLS and "micro_batch_size" not in record["arguments"]
     assert record["num_groups"] == 4 and record["epoch"] in (1, 2)
     card = (whole / "adapter/README.md").read_text()
-    assert "target: surface" in card and "distance to the surface target : distillation = 2:1" in card
+    assert "target: surface" in card and "distance to the surface target : distillation = 1.5:1" in card
     assert "2 images of any groups per update" in card and "one update per group" not in card
     config = (whole / "config.yaml").read_text()
     assert "target: surface" in config and "retain" not in config

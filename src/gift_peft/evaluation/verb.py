@@ -1,5 +1,6 @@
 """`gift-peft evaluate`: load, evaluate, print the table, leave the files."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,6 +47,7 @@ def run_evaluation(
     from gift_peft.evaluation.tables import markdown_table, text_table
     from gift_peft.models.loading import DepthModel
 
+    _check_place(Path(out))
     if booster:  # fail early: large weights take minutes to load
         get_protocol(options.get("protocol", "gift"))
         find_booster(booster, options.get("subset"), options.get("official"))
@@ -76,6 +78,18 @@ def run_evaluation(
     print(text_table(report, color=color))
     print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
     return report
+
+
+def _check_place(folder: Path) -> None:
+    """Raise ValueError if the folder's files of these names are not those of an evaluation."""
+    there = [name for name in ("metrics.json", "rows.jsonl", "report.md") if (folder / name).exists()]
+    try:
+        first = (folder / ("metrics.json" if "metrics.json" in there else "rows.jsonl")).read_text(encoding="utf-8")
+        known = json.loads(first if "metrics.json" in there else first.partition("\n")[0]).keys()
+    except (OSError, ValueError, AttributeError):
+        known = set()
+    if there and not (known >= {"protocol", "summary"} or known >= {"group_id", "image"}):
+        raise ValueError(f"--out {folder}: its {', '.join(there)} is of no evaluation and is kept; name another folder")
 
 
 def make_parser() -> OptionParser:

@@ -215,11 +215,11 @@ def test_unreadable_pictures_are_named(base_dir, photo, tmp_path):
 
 def test_an_adapter_for_other_weights_is_refused(adapter_dir, base_dir, tmp_path):
     other = write_base(tmp_path / "other", seed=1)
-    with pytest.raises(ValueError, match=r"adapter .* was trained on .*, whose files are not those of base .*other"):
+    with pytest.raises(ValueError, match=r"adapter .* was trained on .*, whose weights are not those of base .*other"):
         DepthModel.from_pretrained(other, adapter_dir)
     plain = shutil.copytree(adapter_dir, tmp_path / "plain")
     (plain / "gift.json").unlink()  # as PEFT alone saves: the folder it names still tells
-    with pytest.raises(ValueError, match=r"whose files are not those of base .*other"):
+    with pytest.raises(ValueError, match=r"whose weights are not those of base .*other"):
         DepthModel.from_pretrained(other, plain)
     assert DepthModel.from_pretrained(base_dir, plain).size == SIZE
     moved = shutil.copytree(base_dir, tmp_path / "moved")
@@ -245,16 +245,16 @@ def test_an_adapter_for_other_shapes_or_layers_is_refused(adapter_dir, base_dir,
 
 
 def test_an_adapter_of_another_hub_id_is_refused(adapter_dir, base_dir, tmp_path, monkeypatch):
-    from gift_peft.models import loading
+    from gift_peft.models import adapter_base
 
     hub = shutil.copytree(adapter_dir, tmp_path / "hub")
     config = json.loads((hub / "adapter_config.json").read_text())
     (hub / "adapter_config.json").write_text(json.dumps(config | {"base_model_name_or_path": "org/model-a"}))
     (hub / "gift.json").write_text(json.dumps({"base_revision": "0123abc"}))
-    monkeypatch.setattr(loading, "teacher_revision", lambda base, revision: "4567def")
-    with pytest.raises(ValueError, match=r"was trained on org/model-a, not on base org/model-b"):
-        loading._check_base("org/model-b", None, hub, "org/model-a")
-    loading._check_base("org/model-a", None, hub, "org/model-a")
+    monkeypatch.setattr(adapter_base, "teacher_revision", lambda base, revision: "4567def")
+    with pytest.raises(ValueError, match=r"trained on org/model-a, whose .* base org/model-b: it is another model on"):
+        adapter_base.check_base("org/model-b", None, hub, "org/model-a", accept=False)
+    adapter_base.check_base("org/model-a", None, hub, "org/model-a", accept=False)
     monkeypatch.undo()
     assert DepthModel.from_pretrained(base_dir, hub).size == SIZE  # a local copy of the hub's model
 

@@ -211,6 +211,18 @@ def is_hub_id(name: str | Path) -> bool:
     return not Path(name).exists()
 
 
+def locate(name: str | Path, beside: Path) -> Path | None:
+    """A file or folder that was named elsewhere: as it is named from here, else seen from `beside` or a folder above it,
+    else by its last part in `beside` (or next to it, for what can be no hub id); None if it is nowhere."""
+    path = Path(os.path.expanduser(name))
+    if path.exists():
+        return path
+    beside = Path(os.path.realpath(beside))
+    places = [] if path.is_absolute() else [folder / path for folder in (beside, *beside.parents)]
+    places += [beside / path.name, *([] if is_hub_id(name) else [beside.parent / path.name])]
+    return next((place for place in places if path.name and place.exists()), None)
+
+
 def portable_name(name: str | Path) -> str:
     """What others may read: a hub id as it is, of a path the last part."""
     return str(name) if is_hub_id(name) else Path(name).expanduser().resolve().name

@@ -43,7 +43,7 @@ class PicturesWithoutDepth(ValueError):
 
 def predict_images(
     images: Sequence[str | Path],
-    base: str | Path,
+    base: str | Path | None = None,
     adapter: str | Path | None = None,
     adapter_scale: float | None = None,
     *,
@@ -53,6 +53,7 @@ def predict_images(
     revision: str | None = None,
     focal_length: float | tuple[float, float] | None = None,
     device: "str | torch.device | None" = None,
+    accept_base: bool = False,
     progress: bool = True,
 ) -> list[Path]:
     """Writes `<stem>.npy` and `<stem>.png` per picture and, with an adapter, `<stem>_base.npy/.png` beside them.
@@ -63,7 +64,7 @@ def predict_images(
 
     Args:
         images: files, or folders whose pictures are taken.
-        base, adapter, adapter_scale, revision, size, device: as in `DepthModel.from_pretrained`.
+        base, adapter, adapter_scale, revision, size, device, accept_base: as in `DepthModel.from_pretrained`.
         out: folder; made if missing. What an earlier `predict` left there under these names is replaced, nothing else.
         kind (`str`, *optional*): decides which end is bright; default the recipe's.
         focal_length (*optional*): of the camera in pixels, as in `DepthModel.depth_at`.
@@ -84,7 +85,7 @@ def predict_images(
     folder = Path(out)
     stems = [stem for name in names for stem in ([name] if adapter is None else [name, f"{name}_base"])]
     _check_outputs(folder, stems, files)
-    model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
+    model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
     folder.mkdir(parents=True, exist_ok=True)
     mark = PngInfo()
     mark.add_text(*MARK)
@@ -158,10 +159,10 @@ def make_parser() -> OptionParser:
     parser = OptionParser(
         "predict",
         "Depth of pictures, beside the base's.",
-        "gift-peft predict photo.jpg --base demo/base --adapter demo/adapter --out depth",
+        "gift-peft predict photo.jpg --adapter demo/adapter --out depth",
     )
     parser.add_argument("images", nargs="+", metavar="IMAGE", help="picture files or folders of them")
-    add_base(parser)
+    add_base(parser, required=False)
     add_adapter(parser)
     text = "of the camera that took the pictures, where the model takes one (Metric3D)"
     parser.add_argument("--focal-length", type=float, metavar="PIXELS", help=text)
@@ -170,7 +171,10 @@ def make_parser() -> OptionParser:
 
 
 def run(argv: Sequence[str]) -> int:
-    args = make_parser().parse_args(argv)
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    if args.base is None and args.adapter is None:
+        parser.error("one of --base and --adapter is required")
     reasons: list[str] = []
     try:
         files = predict_images(
@@ -183,6 +187,7 @@ def run(argv: Sequence[str]) -> int:
             kind=args.kind,
             revision=args.revision,
             focal_length=args.focal_length,
+            accept_base=args.accept_base,
         )
     except PicturesWithoutDepth as error:
         files, reasons = error.paths, error.reasons

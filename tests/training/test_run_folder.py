@@ -47,17 +47,26 @@ def test_what_no_run_wrote_is_kept(name, overwrite, base_dir, tree, tmp_path, mo
     if name == "settings":
         (out / "config.yaml").write_text(OWN_CONFIG.format(base=base_dir, tree=tree))
     before = snapshot(out)
-    monkeypatch.setattr("gift_peft.training.loop.load_base", lambda *given: pytest.fail("told before a model is loaded"))
+    monkeypatch.setattr(
+        "gift_peft.training.loop.load_base", lambda *given: pytest.fail("told before a model is loaded")
+    )
     argv = ["--config", str(out / "config.yaml")] if name == "settings" else []
     argv += [f"--base={base_dir}", f"--dataset={tree}", f"--out={out}"] + ["--overwrite_output_dir"] * overwrite
     first = next(iter(PROJECTS[name])).split("/")[0]
-    with pytest.raises(ValueError, match=rf"output_dir: .*project has {first}.*which no run of gift-peft wrote") as error:
+    with pytest.raises(
+        ValueError, match=rf"output_dir: .*project has {first}.*which no run of gift-peft wrote"
+    ) as error:
         train(parse_arguments(argv))
     assert "\n" not in str(error.value) and snapshot(out) == before
 
 
 def test_a_run_in_somebodys_folder_takes_only_its_own_with_it(base_dir, tree, tmp_path):
-    theirs = {"logs/notes.txt": "mine", "logs/gift-peft/notes.txt": "mine", "notes.md": "mine", "runs/a/events.out": ""}
+    theirs = {
+        "logs/notes.txt": "mine",
+        "logs/gift-peft/notes.txt": "mine",
+        "notes.md": "mine",
+        "runs/a/events.out": "",
+    }
     out = write(tmp_path / "out", theirs)
     train(arguments(base_dir, tree, out, max_steps=1, report_to="tensorboard"))
     events = {name for name in snapshot(out) if "tfevents" in name or name.endswith("hparams.yml")}
@@ -126,5 +135,9 @@ def test_a_copy_of_a_runs_config_alone_is_no_settings_of_somebody(base_dir, tree
     out = tmp_path / "new"
     out.mkdir()
     shutil.copy(whole / "config.yaml", out)
-    train(parse_arguments(["--config", str(out / "config.yaml"), f"--out={out}", "--overwrite_output_dir", "--max_steps=1"]))
+    train(
+        parse_arguments(
+            ["--config", str(out / "config.yaml"), f"--out={out}", "--overwrite_output_dir", "--max_steps=1"]
+        )
+    )
     assert (out / "adapter").is_dir() and f"output_dir: {out}" in (out / "config.yaml").read_text()

@@ -169,7 +169,7 @@ def read_adapter_config(adapter: str | Path) -> LoraConfig:
 def read_gift(adapter: str | Path) -> dict[str, Any]:
     """An adapter folder's gift.json; empty without one (an adapter that PEFT alone saved, or one on the hub)."""
     content = _read_object(adapter, GIFT) if (Path(adapter) / GIFT).is_file() else {}
-    for name, values in (("base_revision", None), ("kind", KINDS)):
+    for name, values in (("base_revision", None), ("base_weights", None), ("kind", KINDS)):
         value = content.get(name)
         if value is not None and (not isinstance(value, str) or (values and value not in values)):
             raise ValueError(f"adapter {adapter}: damaged {GIFT} ({name} cannot be {str(value)[:80]!r})")

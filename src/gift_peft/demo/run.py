@@ -58,7 +58,7 @@ def run_demo(
     Raises:
         ValueError: `out` holds a run already, or files in the demo's way that no demo wrote, or an argument is wrong.
     """
-    out = Path(out)
+    out = Path(out).expanduser()
     own = [f"--model_name_or_path={out}/base", f"--dataset_name={out}/gift-i", f"--output_dir={out}"]
     own += [f"--size={SIZE}", f"--seed={seed}", *SETTINGS, "--license=apache-2.0"]
     if overwrite_output_dir:

@@ -27,7 +27,7 @@ from gift_peft.prepare.job import FORMAT, Job, Outcome
 from gift_peft.prepare.out_folder import alone, check_places, side_by_side
 from gift_peft.prepare.page import write_html
 from gift_peft.prepare.settings import PrepareSettings
-from gift_peft.rules import SPLITS
+from gift_peft.rules import MAX_GROUP_ID, SPLITS
 
 STATE = ".prepare"  # in OUT: one record per finished group, and groups on their way
 
@@ -180,9 +180,13 @@ def _staged(job: Job, outcome: Outcome) -> dict[str, int]:
 
 
 def _write_record(out: Path, job: Job, outcome: Outcome, files: dict[str, int]) -> dict:
-    """The last step of a group: only a group with a record that states its digest counts as finished."""
+    """The last step of a group: only a group with a record that states its digest counts as finished.
+
+    One that was rejected for its long name has no record.
+    """
     record = {"format": FORMAT, **vars(outcome), "files": files}
-    write_whole(_record_path(out, job.split, job.group_id), json.dumps(record, allow_nan=False))
+    if len(os.fsencode(job.group_id)) <= MAX_GROUP_ID:
+        write_whole(_record_path(out, job.split, job.group_id), json.dumps(record, allow_nan=False))
     return record
 
 
@@ -195,6 +199,8 @@ def _install(out: Path, job: Job, outcome: Outcome) -> dict[str, int]:
     before, staged = _own_files(out, job.split, job.group_id), _staged(job, outcome)
     places = _places(out, job.split, job.group_id)
     replaced = {name: size for name, size in _sizes(out, places).items() if name in before}
+    if not (before or staged):
+        return {}
     claim = {"format": FORMAT, "digest": None, "files": staged, "replaced": replaced}
     write_whole(_record_path(out, job.split, job.group_id), json.dumps(claim))
     remove_files(out, before)

@@ -26,7 +26,7 @@ from gift_peft.files import read_yaml, remove_folder, strangers, whole_folder, w
 from gift_peft.images import image_digest, is_image_file, read_image
 from gift_peft.prepare.job import capture_digest, printable
 from gift_peft.prepare.out_folder import alone, check_places, side_by_side
-from gift_peft.rules import SPLITS
+from gift_peft.rules import SPLITS, check_group_id
 from gift_peft.surface_targets import paint_fills
 
 VERB, STATE = "synthesize", ".synthesize"
@@ -202,6 +202,7 @@ def _make_group(job: _Job) -> _Outcome:
     """Write the group of one photo unless it is there already. What is wrong with the photo is in the outcome."""
     foreign = _foreign(job.folder)
     try:
+        check_group_id(job.folder.name)
         check_masks(job.capture)
         if job.name != printable(job.name):
             raise ValueError(f"{printable(job.name)}: the name is not valid Unicode text; rename the file")
@@ -213,7 +214,9 @@ def _make_group(job: _Job) -> _Outcome:
             return _Outcome(wrong=foreign)
         pictures, mask = _paint(job)
     except (OSError, ValueError, cv2.error, MemoryError, RecursionError) as error:
-        if foreign is None and job.folder.exists():  # what an earlier run made of this photo is no longer right
+        if foreign is None and os.path.lexists(
+            job.folder
+        ):  # what an earlier run made of this photo is no longer right
             remove_folder(job.folder)
         return _Outcome(wrong=" ".join(str(error).split()) or type(error).__name__)
     known = {key: value for key, value in job.capture.facts.items() if key in ("surface", "notes")}

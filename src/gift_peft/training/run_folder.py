@@ -36,8 +36,10 @@ def check_folder(output: Path, args: GiftTrainingArguments) -> None:
     if metrics.exists() and not _is_metrics(metrics):
         unknown.append(METRICS)
     config = output / CONFIG
-    if config.exists() and not _is_config(config, holds_run(output)) and not (
-        holds_run(output) and _says_the_same(config, args)
+    if (
+        config.exists()
+        and not _is_config(config, holds_run(output))
+        and not (holds_run(output) and _says_the_same(config, args))
     ):
         unknown.append(CONFIG)
     if unknown:

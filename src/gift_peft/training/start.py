@@ -90,7 +90,11 @@ def claim_folder(args: GiftTrainingArguments, accelerator: Accelerator, fresh: b
 
 @contextmanager
 def stop_signals() -> Iterator[SimpleNamespace]:
-    """Inside, SIGINT (Ctrl-C) and SIGTERM (clusters) are noted in `.signum` (else 0); a second SIGINT interrupts."""
+    """Inside, a signal to stop is noted in `.signum` (else 0); a second SIGINT interrupts.
+
+    SIGINT is Ctrl-C, SIGTERM and SIGUSR1 (`sbatch --signal`) come from clusters, SIGHUP from a terminal that closes; who
+    started the run with nohup has that one ignored, and it stays so.
+    """
     stop = SimpleNamespace(signum=0)
 
     def note(signum, frame):
@@ -103,7 +107,11 @@ def stop_signals() -> Iterator[SimpleNamespace]:
     if threading.current_thread() is not threading.main_thread():
         yield stop  # Python delivers signals to the main thread only
         return
-    before = {signum: signal.signal(signum, note) for signum in (signal.SIGINT, signal.SIGTERM)}
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGUSR1", "SIGHUP") if hasattr(signal, name)]  # Windows lacks two
+    wanted = [getattr(signal, name) for name in names]
+    if "SIGHUP" in names and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        wanted.remove(signal.SIGHUP)
+    before = {signum: signal.signal(signum, note) for signum in wanted}
     try:
         yield stop
     finally:

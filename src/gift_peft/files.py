@@ -9,7 +9,7 @@ import os
 import shutil
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -156,10 +156,8 @@ def _places(path: Path) -> list[tuple]:
         except OSError:
             at = folder
         keys.append((at, unicodedata.normalize("NFC", place.name.casefold())))
-    try:
+    with suppress(OSError):
         keys.append((os.stat(path).st_dev, os.stat(path).st_ino))
-    except OSError:
-        pass
     return keys
 
 
@@ -212,8 +210,8 @@ def is_hub_id(name: str | Path) -> bool:
 
 
 def locate(name: str | Path, beside: Path) -> Path | None:
-    """A file or folder that was named elsewhere: as it is named from here, else seen from `beside` or a folder above it,
-    else by its last part in `beside` (or next to it, for what can be no hub id); None if it is nowhere."""
+    """A file or folder that was named elsewhere, or None: as it is named from here, else from `beside` or a folder
+    above it, else by its last part in `beside` (or next to it, for what can be no hub id)."""
     path = Path(os.path.expanduser(name))
     if path.exists():
         return path

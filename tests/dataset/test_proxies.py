@@ -145,7 +145,7 @@ def test_an_earlier_set_that_is_damaged_is_as_none(raw_tree, base_dir):
     old = as_before(make_proxies(base_dir, raw_tree, size=SIZE))
     for path in old.rglob("*.safetensors"):
         path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(FileNotFoundError, match="missing proxy .*56x70"):
+    with pytest.raises(FileNotFoundError, match=r"missing proxy .*56x70"):
         load_gift_i(raw_tree, "train", teacher=base_dir, size=SIZE)[0]
     make_proxies(base_dir, raw_tree, size=SIZE)
     assert load_gift_i(raw_tree, "train", teacher=base_dir)[0]["proxies"].shape == (2, *SIZE)

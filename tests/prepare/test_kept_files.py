@@ -8,6 +8,7 @@ import pytest
 from helpers.photos import capture
 from PIL import Image
 
+from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.prepare import prepare
 from gift_peft.prepare.prepare import prepare_gift_i
 
@@ -91,3 +92,18 @@ def test_what_a_killed_run_left_is_known_as_ours(step, places, monkeypatch):
     report = prepare_gift_i(raw, out)
     assert [entry["status"] for entry in report["groups"]] == ["kept", "kept"]
     assert sorted(path.name for path in (out / "train/a").iterdir()) == ["images", "masks"]
+
+
+def test_a_group_of_a_long_name_is_rejected_alone(places):
+    raw, out = places
+    for name in ("g" * 250, "\u7d75" * 80):
+        (raw / "a").rename(raw / name)
+        for _ in range(2):  # the second time from records
+            report = prepare_gift_i(raw, out)
+            told = {entry["group_id"]: [reason["text"] for reason in entry["reasons"]] for entry in report["groups"]}
+            assert told.pop("b") == [] and load_gift_i(out, "train")["group_id"][:] == ["b"]
+            ((text,),) = told.values()
+            assert f"its name has {len(name.encode())} bytes, at most 210 can be; rename it" in text
+        (raw / name).rename(raw / "a")
+    (raw / "a").rename(raw / ("g" * 210))
+    assert [entry["status"] for entry in prepare_gift_i(raw, out)["groups"]] == ["kept", "kept"]

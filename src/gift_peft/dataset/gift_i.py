@@ -8,9 +8,8 @@ import glob
 import hashlib
 import os
 import re
-import shlex
 from collections import Counter
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -33,6 +32,7 @@ from gift_peft.dataset.proxies import (
     SurfaceStore,
     default_proxies_dir,
     has_earlier_set,
+    proxies_command,
     stored_sizes,
 )
 from gift_peft.dataset.rows import IMAGE_COLUMNS, RowRules
@@ -135,8 +135,8 @@ def load_gift_i(
     weights and the decoded images. Slices, shuffles, selections and DataLoader workers keep them.
 
     Args:
-        path (`str` or `Path`): a prepared folder, a raw tree, a folder of parquet files, what `save_to_disk` wrote, or a
-            hub dataset id.
+        path (`str` or `Path`): a prepared folder, a raw tree, a folder of parquet files, what `save_to_disk` wrote, or
+            a hub dataset id.
         split (`str`): "train" or "validation", slices such as "train[:10]" included.
         teacher (`str` or `Path`, *optional*): the base model whose proxies to attach, a hub id or a folder.
         proxies_dir (`str` or `Path`, *optional*): where `gift-peft proxies` wrote them; default as it has it, the
@@ -162,36 +162,16 @@ def load_gift_i(
         if has_earlier_set(proxies / identity) and Path(teacher).is_dir():
             expected[EARLIER] = earlier_revision(teacher)
         wanted = None if size is None else f"{size[0]}x{size[1]}"
-        sizes = {wanted} if wanted else stored_sizes(proxies / identity, name)
+        sizes = [wanted] if wanted else sorted(stored_sizes(proxies / identity, name))
         if len(sizes) > 1:
-            raise ValueError(f"dataset {path}: proxies of {identity} at {' and '.join(sorted(sizes))}: give the size")
-        expected |= {"size": found for found in sizes}
+            raise ValueError(f"dataset {path}: proxies of {identity} at {' and '.join(sizes)}: give the size")
+        expected |= {"size": sizes[0]} if sizes else {}
         command = partial(proxies_command, teacher, path, wanted, proxies_dir, revision)
-        place = (str(proxies / identity), next(iter(sizes), "<size>"), name)
+        place = (str(proxies / identity), expected.get("size", "<size>"), name)
         rules = replace(rules, proxies=ProxyStore(*place, expected, command()))
         if surface is not None:
             rules = replace(rules, surface=SurfaceStore(*place, expected | surface.header(), command(surface)))
     return rules.apply(dataset)
-
-
-def proxies_command(
-    teacher, path, size=None, proxies_dir=None, revision=None, surface: SurfaceSettings | None = None
-) -> str:
-    """The shell command that makes these proxies, or surface targets."""
-    options = {
-        "--base": teacher,
-        "--dataset": path,
-        "--size": size,
-        "--proxies_dir": proxies_dir,
-        "--revision": revision,
-    }
-    if surface is not None:
-        options["--target"] = "surface"
-        for field in fields(surface):
-            value = getattr(surface, field.name)
-            options[f"--{field.name}"] = None if value == field.default else value
-    given = [part for option, value in options.items() if value is not None for part in (option, str(value))]
-    return shlex.join(["gift-peft", "proxies", *given])
 
 
 def gift_i_splits(path: str | Path) -> list[str]:
@@ -227,7 +207,8 @@ def _load_saved(saved: dict[str, datasets.Dataset], split: str, path: str | Path
     rows = saved[name].with_format(None)
     if missing := FEATURES.keys() - rows.features.keys():
         raise ValueError(f"dataset {path}: it lacks the column {min(missing)} of GIFT-I")
-    return rows.select_columns(list(FEATURES)).select(range(part.from_, part.to)).cast(FEATURES)
+    rows = rows.select_columns(list(FEATURES)).select(range(part.from_, part.to))
+    return rows if rows.features == FEATURES else rows.cast(FEATURES)
 
 
 def _holds_parquet(folder: Path) -> bool:

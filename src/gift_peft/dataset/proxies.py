@@ -15,8 +15,9 @@ import hashlib
 import json
 import os
 import re
+import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,6 +94,26 @@ def default_proxies_dir(dataset: str | Path, teacher: str) -> Path:
         resolved = str(folder.resolve())
         slug = f"{folder.resolve().name}-{hashlib.sha256(resolved.encode()).hexdigest()[:12]}"
     return Path(HF_HOME) / "gift-peft" / "proxies" / slug
+
+
+def proxies_command(
+    teacher, path, size=None, proxies_dir=None, revision=None, surface: SurfaceSettings | None = None
+) -> str:
+    """The shell command that makes these proxies, or surface targets."""
+    options = {
+        "--base": teacher,
+        "--dataset": path,
+        "--size": size,
+        "--proxies_dir": proxies_dir,
+        "--revision": revision,
+    }
+    if surface is not None:
+        options["--target"] = "surface"
+        for field in fields(surface):
+            value = getattr(surface, field.name)
+            options[f"--{field.name}"] = None if value == field.default else value
+    given = [part for option, value in options.items() if value is not None for part in (option, str(value))]
+    return shlex.join(["gift-peft", "proxies", *given])
 
 
 def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: torch.Tensor | None) -> None:

@@ -35,7 +35,7 @@ def teacher_id(base: str | Path, revision: str | None = None) -> str:
 
 
 def check_base_name(base: str | Path) -> None:
-    """Raise FileNotFoundError unless `base` is a folder or could be a hub id, ValueError if it is an adapter's folder."""
+    """Raise FileNotFoundError unless `base` is a folder or could be a hub id, ValueError for an adapter's folder."""
     folder = Path(base)
     if not folder.is_dir() and not is_hub_id(base):
         raise FileNotFoundError(f"base model {base}: no such folder")
@@ -46,8 +46,8 @@ def check_base_name(base: str | Path) -> None:
 def adapter_as_base(base: str | Path) -> ValueError:
     """The error that says what to do with an adapter in the place of a base."""
     return ValueError(
-        f"base model {base}: this is an adapter. To use it: --base ITS-BASE --adapter {base}. To go on with its run: the "
-        "run's command with --resume_from_checkpoint latest. To train on top of it, merge it first: "
+        f"base model {base}: this is an adapter. To use it: --base ITS-BASE --adapter {base}. To go on with its run: "
+        "the run's command with --resume_from_checkpoint latest. To train on top of it, merge it first: "
         f'PeftModel.from_pretrained(base, "{base}").merge_and_unload().save_pretrained("merged")'
     )
 
@@ -84,15 +84,12 @@ def earlier_revision(base: str | Path) -> str:
 
 
 def weights_difference(one: str, other: str) -> str | None:
-    """How the weights of `other` differ from those of `one` (two `weights_revision`), in words; None if they do not."""
+    """How the weights of `other` differ from those of `one` (each a `weights_revision`), in words; None if equal."""
     parts = [revision.removeprefix(TENSORS).split("-") for revision in (one, other)]
     if parts[0][0] != parts[1][0]:
         return f"it has {parts[1][0]} tensors, not {parts[0][0]}"
-    words = (
-        "its tensors have other names or shapes",
-        "its tensors have other values",
-        "its config.json says otherwise",
-    )
+    words = ["its tensors have other names or shapes", "its tensors have other values"]
+    words.append("its config.json says otherwise")
     return next((text for text, a, b in zip(words, parts[0][1:], parts[1][1:], strict=True) if a != b), None)
 
 

@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save_file
 
 from gift_peft.adapters.folder import ADAPTER_FILES, ADAPTER_WEIGHTS
 from gift_peft.dataset.gift_i import dataset_fingerprint
-from gift_peft.files import jsonable, reason, remove_folder, strangers, whole_folder, write_whole
+from gift_peft.files import jsonable, reason, remove_folder, whole_folder, write_whole
 from gift_peft.models.identity import teacher_revision
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
 

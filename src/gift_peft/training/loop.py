@@ -20,8 +20,9 @@ from peft import PeftModel
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import GiftRecipe, get_gift_model, get_recipe
 from gift_peft.dataset.cache import default_cache_dir
-from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
+from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.loader import PreparedGroups
+from gift_peft.dataset.proxies import proxies_command
 from gift_peft.dataset.tensors import Group
 from gift_peft.models.identity import weights_revision
 from gift_peft.models.loading import DepthModel, load_base

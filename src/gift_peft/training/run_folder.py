@@ -92,7 +92,7 @@ def _is_ours(folder: Path) -> bool:
 def _is_metrics(path: Path) -> bool:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-        return ROW <= json.loads(lines[0]).keys()
+        return json.loads(lines[0]).keys() >= ROW
     except (OSError, ValueError, AttributeError, LookupError):
         return False
 

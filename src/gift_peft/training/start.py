@@ -92,8 +92,8 @@ def claim_folder(args: GiftTrainingArguments, accelerator: Accelerator, fresh: b
 def stop_signals() -> Iterator[SimpleNamespace]:
     """Inside, a signal to stop is noted in `.signum` (else 0); a second SIGINT interrupts.
 
-    SIGINT is Ctrl-C, SIGTERM and SIGUSR1 (`sbatch --signal`) come from clusters, SIGHUP from a terminal that closes; who
-    started the run with nohup has that one ignored, and it stays so.
+    SIGINT is Ctrl-C, SIGTERM and SIGUSR1 (`sbatch --signal`) come from clusters, SIGHUP from a terminal that closes;
+    nohup has that one ignored, and it stays so.
     """
     stop = SimpleNamespace(signum=0)
 

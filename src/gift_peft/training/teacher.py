@@ -17,7 +17,7 @@ from accelerate.utils import gather_object, parse_flag_from_env
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
+from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.proxies import (
     EARLIER,
     SURFACE_SUFFIX,
@@ -29,6 +29,7 @@ from gift_peft.dataset.proxies import (
     make_header,
     mask_digests,
     picture_digests,
+    proxies_command,
     read_header,
     write_proxies,
     write_surface,

@@ -25,7 +25,7 @@ from safetensors.torch import load_file, save_file
 from gift_peft.adapters.folder import ADAPTER_FILES, ADAPTER_WEIGHTS
 from gift_peft.dataset.gift_i import dataset_fingerprint
 from gift_peft.files import jsonable, reason, remove_folder, whole_folder, write_whole
-from gift_peft.models.identity import teacher_revision
+from gift_peft.models.identity import FILES, earlier_revision, teacher_revision
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
 
 BEST = "best"
@@ -140,6 +140,10 @@ def restore(
         before, state = saved.pop("identity"), State(**saved)
     except (KeyError, TypeError, AttributeError):
         raise ValueError(f"resume_from_checkpoint: {checkpoint} is of another version of gift-peft") from None
+    if str(pinned := before.get("model_name_or_path")).startswith(FILES):  # 0.1.0 pinned files, not tensors
+        base = model.get_base_model().name_or_path
+        if Path(base).is_dir() and pinned == earlier_revision(base):
+            before["model_name_or_path"] = identity["model_name_or_path"]
     _check_identity(before, identity)
     if state.step > total_steps:
         raise ValueError(f"resume_from_checkpoint: {checkpoint} is past the {total_steps} steps of this run")

@@ -5,6 +5,7 @@ side. Everything goes through the code that real runs use; only the settings dif
 with true depth, and the base was pre-trained on rooms without a mirror or glass (`examples/tools/embedded/`).
 """
 
+import filecmp
 import os
 import shutil
 from collections.abc import Sequence
@@ -17,14 +18,16 @@ from gift_peft.demo.side_by_side import markdown, panels, summary
 from gift_peft.demo.validation_page import validation_page
 from gift_peft.evaluation.evaluate import REFERENCES, evaluate_gift_i
 from gift_peft.evaluation.results import Report
-from gift_peft.files import whole_folder, write_whole
+from gift_peft.files import read_yaml, strangers, whole_folder, write_whole
 from gift_peft.models.loading import DepthModel
 from gift_peft.options import use_color
 from gift_peft.reports.figures import save_grid
 from gift_peft.training import GiftTrainingArguments, train
 from gift_peft.training.arguments import parse_arguments
+from gift_peft.training.run_folder import holds_run
 
 SIZE = "112x140"
+OUTPUTS = ("before_after.png", "validation.html", "report.md", "evaluation-proxy", "evaluation-depth")
 # What differs from the paper's settings, because the model is 200 times smaller and the groups are fewer: so few
 # updates need a high learning rate, which must fall for depths to settle, and less distillation to agree in time.
 # While the rate is high the predictions agree best where they have also moved most outside the target, so no epoch
@@ -59,19 +62,24 @@ def run_demo(
         extra: training arguments that win over the demo's, as on the command line (`--lambda_d=0`).
 
     Raises:
-        ValueError: `out` holds a run already, or an argument is wrong.
+        ValueError: `out` holds a run already, or files in the demo's way that no demo wrote, or an argument is wrong.
     """
-    out = Path(out)
+    out = Path(out).expanduser()
     targets = [target] if target else list(OBJECTIVES)
     runs = {name: out if name == targets[0] else out / name for name in targets}
     arguments = {name: _arguments(name, out, run, overwrite_output_dir, seed, extra) for name, run in runs.items()}
     for run, args in zip(runs.values(), arguments.values(), strict=True):
-        if (run / "metrics.jsonl").exists() and not overwrite_output_dir and not args.resume_from_checkpoint:
+        if holds_run(run) and not overwrite_output_dir and not args.resume_from_checkpoint:
             raise ValueError(
                 f"out: {run} already holds a run; --overwrite_output_dir deletes it, --out names another folder"
             )
+    earlier = _holds_demo(out)
+    if not earlier and (there := [name for name in OUTPUTS if (out / name).exists()]):
+        raise ValueError(
+            f"out: {out} has {', '.join(there)}, which no demo wrote: it is kept; --out names another folder"
+        )
     for name in ("base", "gift-i"):
-        _copy_embedded(name, out / name)
+        _copy_embedded(name, out / name, earlier)
     for number, (name, args) in enumerate(arguments.items(), 1):
         if len(arguments) > 1:
             print(f"Training {number} of {len(arguments)}: {LABELS[name]}", flush=True)
@@ -125,12 +133,27 @@ def _evaluate(model: DepthModel, groups, out: Path, run: Path, seed: int) -> dic
     return reports
 
 
-def _copy_embedded(name: str, destination: Path) -> None:
-    """A folder of the package, replaced as a whole; proxies made for the very same content stay."""
+def _holds_demo(out: Path) -> bool:
+    """Whether the run in a folder is a demo's: of the base and the groups beside it."""
+    if not holds_run(out) or not (out / "config.yaml").is_file():
+        return False
+    arguments = read_yaml(out / "config.yaml")
+    names = [Path(str(arguments.get(key))).name for key in ("model_name_or_path", "dataset_name")]
+    return names == ["base", "gift-i"]
+
+
+def _copy_embedded(name: str, destination: Path, earlier: bool) -> None:
+    """A folder of the package; that of an `earlier` demo is replaced as a whole where it differs.
+
+    Proxies stay: they are checked against what they were made for.
+    """
     with as_file(files("gift_peft.demo") / name) as source:
         if not source.is_dir():
             raise FileNotFoundError(f"the installed package lacks gift_peft/demo/{name}; install it again")
-        with whole_folder(destination) as place:
+        contents = strangers(source)
+        if filecmp.cmpfiles(source, destination, contents, shallow=False)[0] == contents:
+            return
+        with whole_folder(destination, [*contents, "proxies/*"] if earlier else ()) as place:
             shutil.copytree(source, place, dirs_exist_ok=True)
             if (destination / "proxies").is_dir():
                 os.replace(destination / "proxies", place / "proxies")

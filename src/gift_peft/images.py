@@ -33,7 +33,7 @@ LOSSY = {"JPEG", "MPO", "WEBP", "AVIF", "HEIF"}  # formats that do not keep the 
 COMPANIONS = {
     ".txt", ".md", ".rst", ".csv", ".tsv", ".json", ".jsonl", ".yaml", ".yml", ".toml", ".xml", ".html", ".pdf",
     ".log", ".xmp", ".aae", ".thm", ".lrc", ".lnk", ".url", ".py", ".ipynb", ".npy", ".npz", ".parquet",
-    ".safetensors",    ".dvc", ".lock",
+    ".safetensors", ".dvc", ".lock",
 }  # fmt: skip
 SINGLE_CHANNEL = ("1", "L", "P", "I", "I;16", "I;16B", "I;16L")
 
@@ -91,8 +91,8 @@ def open_image(source: str | Path | bytes | Image.Image, name: str | None = None
             image.format = stored  # a copy has none, and masks go by it
     except FileNotFoundError:
         dangling = isinstance(source, str | Path) and Path(source).is_symlink()
-        why = "a link that leads nowhere; fetch its content (git annex get, dvc pull, hf download)"
-        raise FileNotFoundError(f"{name}: {why if dangling else 'no such file'}") from None
+        why = "; the link leads nowhere: fetch its content (git annex get, dvc pull, hf download)" if dangling else ""
+        raise FileNotFoundError(f"{name}: no such file{why}") from None
     except (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError) as error:
         hint = f"; it is HEIC: {HEIF_HINT}" if _is_heif(source) and not reads_heif() else f" ({reason(error)})"
         raise ValueError(f"{name}: not a readable image, or truncated{hint}") from None

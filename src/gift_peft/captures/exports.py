@@ -71,10 +71,15 @@ def find_entry(names: Sequence[str], photo: Path, group_dir: Path, export: Path,
     """
     inside = base == group_dir
     needed = _parts(photo.relative_to(group_dir if inside else group_dir.parent).as_posix())
-    for strip in (False, True):
+    for form in (_parts, _stripped, _loose):
+        if form is _loose:  # the export of photos that were converted, or renamed by a system without capitals
+            alike = [name for name in photo_names(group_dir) if name.casefold() == same_name(photo.stem).casefold()]
+            if len(alike) > 1:
+                break
+            needed = _loose("/".join(needed))
         matches, short = [], False
         for name in names:
-            parts = _stripped(name) if strip else _parts(name)
+            parts = form(name)
             if parts[-len(needed) :] == needed:
                 matches.append(name)
             elif inside and needed[-len(parts) :] == parts:
@@ -130,6 +135,12 @@ def _only(matches: list[str], photo: Path, export: Path) -> str:
 
 def _parts(name: str) -> tuple[str, ...]:
     return PurePosixPath(same_name(name)).parts
+
+
+def _loose(name: str) -> tuple[str, ...]:
+    """Without regard to capitals and to the suffix of a picture."""
+    *folders, last = _stripped(name)
+    return (*folders, PurePosixPath(last).stem.casefold())
 
 
 def _stripped(name: str) -> tuple[str, ...]:

@@ -274,5 +274,5 @@ def _check_levels(image: Image.Image, mask: np.ndarray, path: Path) -> None:
     if drawn or 1 < high < 128:
         found = f"the values {low} and {high}" if drawn else f"the value {high}"
         raise ValueError(
-            f"{path}: {found}, neither black nor white; name the target's in group.yaml (`mask_class: {high}`)"
+            f"{path}: {found}, not black and white; name the target's in group.yaml (`mask_class: {high}`)"
         )

@@ -264,7 +264,8 @@ def _check_empty(capture: Capture, decoded: Decoded, empty_masks: str, may_lack:
         raise ValueError(
             f"group {capture.folder}: {', '.join(without)} {'has' if one else 'have'} no target in "
             f"{'its' if one else 'their'} mask or annotation{beside}. Annotate {'it' if one else 'them'}, or, if no "
-            "mirror or glass shows there, say so: `empty_masks: allow` in group.yaml, or --empty-masks allow"
+            "mirror or glass shows there, say so: `empty_masks: allow` in group.yaml, or for all groups "
+            "`gift-peft prepare --empty-masks allow`"
         )
 
 

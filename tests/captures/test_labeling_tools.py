@@ -155,7 +155,9 @@ def test_what_lies_in_front_cuts_and_what_lies_behind_does_not():
     np.testing.assert_array_equal(read_labelme(content, SIZE, "glass"), BOX)
 
 
-@pytest.mark.parametrize("kind", ["rotation", "quadrilateral", "oriented_rectangle", "oriented rectangle", "rectangle"])
+@pytest.mark.parametrize(
+    "kind", ["rotation", "quadrilateral", "oriented_rectangle", "oriented rectangle", "rectangle"]
+)
 def test_four_corners_are_a_polygon(kind):
     corners = turned(3, 2, 6, 4, 30)
     expected = polygon_mask(corners, SIZE)

@@ -94,10 +94,16 @@ def test_transparency_is_read_where_it_can_mean_one_thing():
 
 
 def test_values_that_are_neither_black_nor_white(tmp_path):
-    for values, message in (((0, 2), "the values 0 and 2"), ((200, 255), "200 and 255"), ((9, 9), "the value 9")):
+    for values, message in (
+        ((0, 2), "the values 0 and 2"),
+        ((200, 255), "the values 200 and 255"),
+        ((9, 9), "the value 9"),
+    ):
         path = tmp_path / "m.png"
         Image.fromarray(np.where(BOX, values[1], values[0]).astype(np.uint8)).save(path)
-        with pytest.raises(ValueError, match=rf"m\.png: {message}, not black and white; .* \(`mask_class: {values[1]}`\)"):
+        with pytest.raises(
+            ValueError, match=rf"m\.png: {message}, not black and white; .* \(`mask_class: {values[1]}`\)"
+        ):
             MaskSource(path, "png").read(SIZE)
     np.testing.assert_array_equal(MaskSource(path, "png", None, 9).read(SIZE), np.ones_like(BOX))
 

@@ -176,7 +176,11 @@ BAD = {
     "colours": ("masks/1.png", np.full((8, 12, 3), (9, 0, 0), np.uint8), "masks/1.png: mode RGB"),
     "labelme other size": ("1.json", labelme(imageWidth=13), "1.json: its shapes are for 8x13"),
     "labelme other image": ("1.json", labelme_at("2.jpg"), "1.json: drawn on 2.jpg, not on 1.jpg"),
-    "labelme other, climbs": ("annotations/1.json", labelme_at("..\\1\\2.jpg"), r"drawn on ..\\1\\2.jpg, not on 1.jpg"),
+    "labelme other, climbs": (
+        "annotations/1.json",
+        labelme_at("..\\1\\2.jpg"),
+        r"drawn on ..\\1\\2.jpg, not on 1.jpg",
+    ),
     "labelme other, absolute": ("masks/1.json", labelme_at("/etc/1.jpg/passwd"), "drawn on /etc/1.jpg/passwd"),
     "labelme no name": ("1.json", labelme_at(7), "1.json: imagePath: 7 is not an image's name"),
     "labelme cut short": ("1.json", '{"shapes": [', "1.json: not valid JSON, or cut short"),

@@ -151,7 +151,7 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
     references, links in a loop, an unreadable folder, a damaged `group.yaml` or mask file, painted copies as
     validation.
     """
-    files = list(files_below(folder))
+    files = sorted(files_below(folder))
     pictures = _photos(files, folder)
     skipped = [path for path in skipped_files(files) if not is_mask_file(path, folder)]
     references = [path for path in pictures if _is_reference(path)]

@@ -101,7 +101,7 @@ def test_photos_that_were_converted(raw, name):
     assert look(raw, "cup/1.jpg").entry == name
     assert look(raw, "cup/2.jpg") is None
     (raw / "train/cup/x.json").write_text(json.dumps(many(name, "1.tif")))
-    with pytest.raises(ValueError, match="may both mean 1.jpg"):
+    with pytest.raises(ValueError, match=r"may both mean 1\.jpg"):
         look(raw, "cup/1.jpg")
 
 

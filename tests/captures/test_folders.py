@@ -1,4 +1,4 @@
-"""What lies in a folder of photos: kinds that are read, kinds that are not and are named, and what systems leave there."""
+"""What lies in a folder of photos: kinds that are read, kinds that are not and are named, and what systems leave."""
 
 import json
 import logging

@@ -1,6 +1,7 @@
 """Masks as programs save them: palettes, grey in color channels, transparency, JPEG, and names that nearly fit."""
 
 import io
+import json
 import unicodedata
 
 import numpy as np
@@ -195,7 +196,7 @@ def test_accents_composed_or_not(group, forms, suffix):
     Image.new("RGB", SIZE).save(group / f"{photo}.jpg")
     path = group / "masks" / (mask + ("." if suffix[0] != "_" else "") + suffix)
     if suffix == "json":
-        path.write_text('{"shapes": [], "imagePath": "../%s.jpg"}' % mask)
+        path.write_text(json.dumps({"shapes": [], "imagePath": f"../{mask}.jpg"}))
     else:
         GREY.save(path)
     assert find_mask(group / f"{photo}.jpg", group, group.parents[1]).path == path

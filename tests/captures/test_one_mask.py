@@ -174,7 +174,7 @@ def test_nobody_labeled_anything(group):
 def test_choices_are_checked_and_are_other_datasets(group):
     (group / "x.json").write_text(json.dumps(many("13")))
     raw = str(group.parents[1])
-    with pytest.raises(ValueError, match="have no target|has no target"):
+    with pytest.raises(ValueError, match="has no target"):
         load_gift_i(raw, "train")
     allowed = (
         load_gift_i(raw, "train", empty_masks="allow"),

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gift_peft.captures.folders import files_below, holds_no_photos
+from gift_peft.captures.folders import Listing, files_below, holds_no_photos
 from gift_peft.captures.masks import (
     MaskSource,
     explain_missing,
@@ -174,7 +174,8 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
     if split == "validation" and "synthesized" in facts:
         raise ValueError(f"group {folder}: painted copies of one photo (gift-peft synthesize) are for training only")
     mask_class = facts.get("mask_class")
-    masks = [find_mask(path, folder, root, mask_class) for path in images]
+    listing = Listing()
+    masks = [find_mask(path, folder, root, mask_class, listing) for path in images]
     common = find_group_mask([path for path in files if is_group_mask(path)], images[0], root, mask_class)
     reference = references[0] if references else None
     return Capture(folder, folder.name, split, images, masks, reference, facts, common, skipped, root)

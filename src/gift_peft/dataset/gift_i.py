@@ -27,7 +27,7 @@ from tqdm import tqdm
 from gift_peft.captures.tree import list_groups, raw_example
 from gift_peft.dataset.proxies import FORMAT, ProxyStore, SurfaceSettings, SurfaceStore, default_proxies_dir
 from gift_peft.dataset.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
-from gift_peft.files import is_hub_id, reason
+from gift_peft.files import is_hub_id, is_leftover, reason
 from gift_peft.images import image_digest, natural_key
 from gift_peft.models.identity import teacher_id, teacher_revision
 from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
@@ -211,7 +211,8 @@ def _prepared_splits(folder: Path) -> list[str]:
 
 
 def _holds_parquet(folder: Path) -> bool:
-    return any(folder.glob("*.parquet")) or any(folder.glob("*/*.parquet"))
+    found = (*folder.glob("*.parquet"), *folder.glob("*/*.parquet"))
+    return any(not is_leftover(path.name) and not is_leftover(path.parent.name) for path in found)
 
 
 def _load_rows(path: str | Path, split: str, revision: str | None, empty_masks: str) -> datasets.Dataset:

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from gift_peft.captures.masks import is_mask_file
 from gift_peft.captures.tree import Capture, check_masks, find_groups, read_capture
-from gift_peft.files import read_yaml, remove_folder, whole_folder, write_whole
+from gift_peft.files import is_leftover, read_yaml, remove_folder, whole_folder, write_whole
 from gift_peft.images import image_digest, is_image_file, read_image
 from gift_peft.prepare.job import capture_digest, printable
 from gift_peft.prepare.out_folder import alone, check_places, side_by_side
@@ -231,7 +231,9 @@ def _make_group(job: _Job) -> _Outcome:
 
 def _paint(job: _Job) -> tuple[list[Image.Image], np.ndarray]:
     """The photo and its painted copies, and the mask; ValueError or another error naming the file."""
-    path, source = job.capture.images[0], job.capture.masks[0] or job.capture.common
+    path, source = job.capture.images[0], job.capture.masks[0]
+    if source is None or not source.annotated:
+        source = job.capture.common or source
     image = read_image(path)
     mask = source.read(image.size)
     if not mask.any():
@@ -287,7 +289,8 @@ def _foreign(folder: Path) -> str | None:
     mark = _mark(folder)
     if mark is None:
         return f"{folder}: not made by gift-peft synthesize, so it is left as it is; move it away"
-    found = {path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir() and path.name[0] != "."}
+    found = {path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()}
+    found = {path for path in found if not any(map(is_leftover, path.parts))}
     others = sorted({path.as_posix() for path in found} - _files(mark))
     if others:
         return f"{folder / others[0]}: not made by gift-peft synthesize, so its group is left as it is; move it away"

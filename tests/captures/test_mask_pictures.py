@@ -39,7 +39,7 @@ def indexed(mask, colors, numbers=(0, 1)) -> Image.Image:
 BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 
-@given(mask=arrays(bool, (5, 7)), numbers=st.permutations(range(256)).map(lambda order: order[:2]))
+@given(mask=arrays(bool, (5, 7)), numbers=st.lists(st.integers(0, 255), min_size=2, max_size=2, unique=True))
 @settings(max_examples=40)
 def test_a_palette_is_read_by_its_colors_whatever_their_order(mask, numbers):
     for kind in ("PNG", "GIF"):

@@ -252,12 +252,17 @@ def _check_empty(capture: Capture, decoded: Decoded, empty_masks: str, may_lack:
     some = any(mask is not None and mask.any() for mask in shown)
     without = []
     for place, ((path, source), mask) in enumerate(zip(files, decoded.masks, strict=True)):
-        if (mask is not None and mask.any()) or (mask is None and (decoded.common is not None or may_lack)):
+        if mask is None and decoded.common is not None:  # an empty one is no stand-in for a target either
+            mask, source = decoded.common, capture.common or source
+            if mask.any() or not some:
+                continue
+        elif may_lack if mask is None else mask.any():
             continue
         if source is None:
             raise FileNotFoundError(explain_missing(path, capture.folder, capture.root or capture.folder))
-        without.append(f"{path.name} ({source.path.name})")
-        if mask is None:
+        inside = source.path.is_relative_to(capture.folder)
+        without.append(f"{path.name} ({capture.name(source.path) if inside else source.path.name})")
+        if decoded.masks[place] is None:
             decoded.masks[place] = np.zeros(decoded.images[place].size[::-1], bool)
     if empty_masks == "refuse" and without and (some or not all(source.annotated for _, source in files if source)):
         one = len(without) == 1

@@ -212,7 +212,7 @@ def _prepared_splits(folder: Path) -> list[str]:
 
 def _holds_parquet(folder: Path) -> bool:
     found = (*folder.glob("*.parquet"), *folder.glob("*/*.parquet"))
-    return any(not is_leftover(path.name) and not is_leftover(path.parent.name) for path in found)
+    return any(not any(map(is_leftover, path.relative_to(folder).parts)) for path in found)
 
 
 def _load_rows(path: str | Path, split: str, revision: str | None, empty_masks: str) -> datasets.Dataset:

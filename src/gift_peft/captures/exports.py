@@ -49,6 +49,12 @@ def _parsed(path: Path, modified: int, length: int) -> tuple[str, dict]:
             return "coco", coco_images(content)
         if isinstance(content, list) and all(isinstance(task, dict) and "data" in task for task in content):
             return "label-studio", label_studio_images(content)
+        if (
+            isinstance(content, list)
+            and content
+            and all(isinstance(item, dict) and "annotation_id" in item for item in content)
+        ):
+            raise ValueError("Label Studio's short form (JSON-MIN) is not read; export as JSON or COCO")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return "other", {}

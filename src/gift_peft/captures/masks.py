@@ -175,6 +175,9 @@ def explain_missing(image_path: Path, group_dir: Path, root: Path) -> str:
             more = f" and {len(strange) - 2} more fit" if len(strange) > 2 else " fit" + "s" * (len(strange) == 1)
             parts.append(f"in {folder.name}/ {', '.join(strange[:2])}{more} no photo's name")
     for base in _bases(group_dir, root):
+        for folder in (base, *listing.subfolders(base, EXPORTS)):
+            xml = [str(path) for path in listing.entries(folder) if path.suffix.lower() == ".xml"]
+            parts += [f"{path} is not read (export as COCO, or as masks)" for path in xml]
         seen = list_exports(base, listing)
         parts += filter(None, (describe_export(path, image_path, base, group_dir, listing) for path in seen))
     return "; ".join([*parts, "`gift-peft prepare RAW OUT --propose-masks` draws first ones"])

@@ -329,9 +329,14 @@ def _subfolders(folder: Path) -> list[Path]:
     folders = (
         path
         for path in folder.iterdir()
-        if not holds_no_photos(path.name) and (path.is_dir() or (path.is_symlink() and not path.exists()))
+        if not _is_no_group(path.name) and (path.is_dir() or (path.is_symlink() and not path.exists()))
     )
     return sorted(folders, key=lambda path: natural_key(path.name))
+
+
+def _is_no_group(folder: str) -> bool:
+    """Folders of exports lie beside groups; but a group may be called `mask`."""
+    return folder.casefold() != "mask" and holds_no_photos(folder)
 
 
 def _photos(files: list[Path], folder: Path) -> list[Path]:

@@ -8,7 +8,6 @@ import glob
 import hashlib
 import os
 import re
-from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,6 @@ from pathlib import Path
 import datasets
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from datasets import ClassLabel, Features, List, Value
 from datasets import Image as ImageFeature
 from datasets.builder import Key
@@ -35,12 +33,13 @@ from gift_peft.dataset.proxies import (
     proxies_command,
     stored_sizes,
 )
-from gift_peft.dataset.rows import IMAGE_COLUMNS, RowRules
-from gift_peft.files import is_hub_id, reason
-from gift_peft.images import image_digest, natural_key
+from gift_peft.dataset.row_checks import check_rows
+from gift_peft.dataset.rows import RowRules
+from gift_peft.files import is_hub_id, is_leftover, reason
+from gift_peft.images import image_digest
 from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.models.pixels import pixel_settings
-from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
+from gift_peft.rules import SPLITS, SURFACES
 
 FEATURES = Features(
     {
@@ -64,7 +63,10 @@ class GiftIConfig(datasets.BuilderConfig):
     """Adds the tree's listing (names, sizes, times) to the cache key: a changed folder is read again.
 
     `datasets` keys the cache by the files it guesses from split words in path names, which may be some or none.
+    `empty_masks` ("refuse" or "allow") says what photos without a target are in groups whose others have one.
     """
+
+    empty_masks: str = "refuse"
 
     def create_config_id(self, config_kwargs: dict, custom_features=None) -> str:
         config_id = super().create_config_id(config_kwargs, custom_features)
@@ -92,25 +94,35 @@ class GiftI(datasets.GeneratorBasedBuilder):
                     "groups": [str(group) for group in groups],
                     "split": split,
                     "root": str(self.config.data_dir),
+                    "empty_masks": self.config.empty_masks,
                 },
             )
             for split, groups in list_groups(self.config.data_dir).items()
         ]
 
-    def _generate_shards(self, groups, split, root):
+    def _generate_shards(self, groups, split, root, empty_masks):
         yield from groups
 
-    def _generate_examples(self, groups, split, root):
+    def _generate_examples(self, groups, split, root, empty_masks):
         for shard, folder in enumerate(groups):
-            yield Key(shard, 0), raw_example(Path(folder), split, Path(root))
+            yield Key(shard, 0), raw_example(Path(folder), split, Path(root), empty_masks)
 
 
 def _listing_digest(folder: str) -> str:
-    digest = hashlib.sha256()
-    for root, folders, files in os.walk(folder):
+    digest, seen = hashlib.sha256(), set()
+    for root, folders, files in os.walk(folder, followlinks=True):
+        real = os.path.realpath(root)
+        if real in seen:  # links in a loop; reading the tree says so
+            folders.clear()
+            continue
+        seen.add(real)
         folders[:] = sorted(name for name in folders if name != "proxies" and not name.startswith("."))
         for name in sorted(files):
-            stat = os.stat(os.path.join(root, name))
+            try:
+                stat = os.stat(os.path.join(root, name))
+            except OSError as error:  # a link that leads nowhere
+                digest.update(f"{os.path.relpath(root, folder)}/{name} {error.errno}\n".encode())
+                continue
             digest.update(f"{os.path.relpath(root, folder)}/{name} {stat.st_size} {stat.st_mtime_ns}\n".encode())
     return digest.hexdigest()[:16]
 
@@ -127,6 +139,7 @@ def load_gift_i(
     size: tuple[int, int] | None = None,
     dataset_revision: str | None = None,
     surface: SurfaceSettings | None = None,
+    empty_masks: str = "refuse",
 ) -> datasets.Dataset:
     """GIFT-I groups, checked, as a `datasets.Dataset` with `FEATURES`; with a teacher also their proxies.
 
@@ -148,13 +161,15 @@ def load_gift_i(
         dataset_revision (`str`, *optional*): of a hub dataset.
         surface (`SurfaceSettings`, *optional*): with a teacher, attaches the surface targets made with these settings:
             accessed rows also have `surface_target` and `surface_target_flipped` (N, h, w), float32 tensors.
+        empty_masks (`str`): of a raw tree, what photos without a target are in groups whose others have one: an error
+            ("refuse"), or photos in which no target shows ("allow"). `empty_masks` in a `group.yaml` comes first.
 
     Raises:
         FileNotFoundError, ValueError: one line that names the file or group and says what to do.
     """
-    dataset = _load_rows(path, split, dataset_revision)
+    dataset = _load_rows(path, split, dataset_revision, empty_masks)
     name = re.match(r"\w*", str(split)).group()
-    dataset = _check_rows(dataset, name, path)
+    dataset = check_rows(dataset, name, path, _picture_roots(path))
     rules = RowRules(train=name == "train")
     if teacher is not None:
         identity = teacher_id(teacher, revision)
@@ -223,10 +238,11 @@ def _load_saved(saved: dict[str, datasets.Dataset], split: str, path: str | Path
 
 
 def _holds_parquet(folder: Path) -> bool:
-    return any(folder.glob("*.parquet")) or any(folder.glob("*/*.parquet"))
+    found = (*folder.glob("*.parquet"), *folder.glob("*/*.parquet"))
+    return any(not any(map(is_leftover, path.relative_to(folder).parts)) for path in found)
 
 
-def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.Dataset:
+def _load_rows(path: str | Path, split: str, revision: str | None, empty_masks: str) -> datasets.Dataset:
     """Rows whose images are still paths or bytes, under FEATURES."""
     folder = Path(path)
     if "+" in str(split):
@@ -245,7 +261,7 @@ def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.D
         if _holds_parquet(folder):
             return datasets.load_dataset(str(folder), split=split, features=FEATURES)
         _check_split(split, list_groups(folder), path)
-        builder = GiftI(data_dir=str(folder))
+        builder = GiftI(data_dir=str(folder), empty_masks=empty_masks)
         builder.download_and_prepare()
         return builder.as_dataset(split=split)
     except (FileNotFoundError, ValueError):
@@ -277,58 +293,6 @@ def _check_split(split: str, present, path) -> None:
         raise ValueError(f"dataset {path}: no split {split!r}, only {', '.join(present)}")
 
 
-def _check_rows(dataset: datasets.Dataset, split: str, path) -> datasets.Dataset:
-    """Check all that needs no decoding; the dataset with images in natural order and none listed twice."""
-    counts = Counter(dataset["group_id"])
-    for group_id, count in counts.items():
-        check_group_id(group_id)
-        if count > 1:
-            raise ValueError(f"dataset {path}: {count} groups are called {group_id!r} in split {split}")
-    tables = dataset.with_format("arrow")
-    roots = _picture_roots(path)
-    keep = [_check_row(tables[index], split, roots) for index in range(len(dataset))]
-    if all(order == list(range(count)) for order, count in keep):
-        return dataset
-    stored = dataset.cast(_undecoded(dataset.features))
-    columns = ("image_names", *IMAGE_COLUMNS)
-    return stored.map(
-        lambda row, index: {key: [row[key][k] for k in keep[index][0]] for key in columns if row[key]},
-        with_indices=True,
-        features=stored.features,
-    ).cast(dataset.features)
-
-
-def _check_row(table: pa.Table, split: str, roots: list[str]) -> tuple[list[int], int]:
-    """Of one row: the images to keep, in natural order, and how many there are."""
-    group_id, names = table["group_id"][0].as_py(), table["image_names"][0].as_py() or []
-    for column in IMAGE_COLUMNS:
-        files = table[column][0].values
-        count = 0 if files is None else len(files)
-        if count != len(names) and (count or column in ("images", "masks")):
-            raise ValueError(f"group {group_id}: {len(names)} image names, but a list of {count} {column}")
-        _check_present(files, f"group {group_id}: missing {column.removesuffix('s')}", roots)
-    _check_present(table["reference"].combine_chunks(), f"group {group_id}: missing reference", roots)
-    contents = _contents(table["images"][0].values)
-    order = sorted(range(len(names)), key=lambda index: natural_key(names[index]))
-    first = {}
-    for index in order:
-        first.setdefault(contents[index], index)
-    check_count(group_id, len(first), split, table["reference"][0].is_valid)
-    return list(first.values()), len(names)
-
-
-def _check_present(files: pa.StructArray | None, missing: str, roots: list[str]) -> None:
-    files = None if files is None else files.drop_null()  # a null's fields may hold anything, an empty path for one
-    for file in [] if files is None else files.field("path").filter(files.field("bytes").is_null()).to_pylist():
-        if file is None:
-            continue
-        if not _is_inside(file, roots):
-            hint = "" if roots else "; in a parquet release the pictures are embedded (`gift-peft export`)"
-            raise ValueError(f"{missing.replace(': missing ', ', ')}: {file} is a path outside of the dataset{hint}")
-        if "://" not in file and not os.path.exists(file):
-            raise FileNotFoundError(f"{missing} {file}")
-
-
 def _picture_roots(path: str | Path) -> list[str]:
     """Where pictures may lie that a row names by path: whoever wrote the row shall not choose any file of ours."""
     folder = Path(path)
@@ -338,37 +302,6 @@ def _picture_roots(path: str | Path) -> list[str]:
     if not _prepared_splits(folder) and _holds_parquet(folder):
         return []
     return [os.path.abspath(folder)]
-
-
-def _is_inside(file: str, roots: list[str]) -> bool:
-    place = file.rsplit("::", 1)[-1]  # of an archive's member, the archive
-    if "://" in place:
-        return "hf://" in roots and place.startswith("hf://")
-    return any(os.path.abspath(place).startswith(os.path.join(root, "")) for root in roots)
-
-
-def _contents(images: pa.StructArray) -> list:
-    """Something equal for equal files: a digest where sizes collide, else just the position."""
-    paths = images.field("path").to_pylist()
-    lengths = pc.binary_length(images.field("bytes")).to_pylist()
-    sizes = [
-        length if length is not None else path if "://" in path else os.path.getsize(path)
-        for path, length in zip(paths, lengths, strict=True)
-    ]
-    counts = Counter(sizes)
-    contents = []
-    for index, size in enumerate(sizes):
-        if counts[size] == 1 or isinstance(size, str):
-            contents.append(size if isinstance(size, str) else index)
-        else:
-            content = images.field("bytes")[index].as_py() or Path(paths[index]).read_bytes()
-            contents.append(hashlib.sha256(content).digest())
-    return contents
-
-
-def _undecoded(features: Features) -> Features:
-    plain = ImageFeature(decode=False)
-    return Features({**features, **dict.fromkeys(IMAGE_COLUMNS, List(plain)), "reference": plain})
 
 
 def dataset_fingerprint(dataset: datasets.Dataset) -> str:

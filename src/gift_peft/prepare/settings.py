@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from gift_peft.captures.foreign import Layout
+from gift_peft.captures.tree import EMPTY_MASKS
 
 
 def _option(text: str, metavar: str = "X", least: int = 0) -> dict:
@@ -88,6 +89,11 @@ class PrepareSettings:
         "propose masks for groups that lack any, into OUT/masks_proposed; they are not used", False
     )
     accept_proposed_masks: bool = _arg("use the proposed masks, which the dataset card then says", False)
+    empty_masks: str = field(
+        default="refuse",
+        metadata=_option("what photos without a target are in a group whose others have one: an error, or fine")
+        | {"choices": EMPTY_MASKS},
+    )
     refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
     layout: Layout | None = field(
         default=None, metadata=_option("YAML file that says where RGB and mask files lie", metavar="FILE")

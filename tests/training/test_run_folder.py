@@ -113,7 +113,7 @@ def test_a_config_edited_by_hand_stays_or_is_told(base_dir, tree, tmp_path):
     with pytest.raises(ValueError, match=r"has config\.yaml, which .*changed by hand"):
         train_again(args, max_steps=3)
     train(parse_arguments(["--config", str(config), "--resume_from_checkpoint", "latest"]))
-    assert config.read_text() == edited and len(rows_of(out)) == 2
+    assert config.read_text() == edited and len(rows_of(out)) == 3
     train(parse_arguments(["--config", str(config), "--overwrite_output_dir"]))
     assert config.read_text() == edited and len(rows_of(out)) == 2
 

@@ -36,8 +36,8 @@ FORMAT = "gift-peft proxies 1"
 SURFACE_FORMAT = "gift-peft surface targets 1"
 METADATA = "gift_peft"
 SURFACE_SUFFIX = ".surface"
-TOLD = "told"  # of a surface target's header: what `evaluation.surface_check.describe` knows; never compared
 EARLIER = "earlier_revision"  # expected of files of 0.1.0 in place of the revision; never written
+TOLD = "told"  # of a surface target's header: what `evaluation.surface_check.describe` knows; never compared
 # What a header says apart from pixels, in the order in which differences are told, and in words where those differ.
 STATED = ("format", "teacher", "revision", "size", "processor", "kind", "rule")
 STATED += ("fills", "seed", "surface_model", "surface_quantile", "surface_tau")

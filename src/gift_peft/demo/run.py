@@ -24,7 +24,7 @@ from gift_peft.options import use_color
 from gift_peft.reports.figures import save_grid
 from gift_peft.training import GiftTrainingArguments, train
 from gift_peft.training.arguments import parse_arguments
-from gift_peft.training.run_folder import holds_run
+from gift_peft.training.run_folder import check_folder, holds_run
 
 SIZE = "112x140"
 OUTPUTS = ("before_after.png", "validation.html", "report.md", "evaluation-proxy", "evaluation-depth")
@@ -73,11 +73,12 @@ def run_demo(
             raise ValueError(
                 f"out: {run} already holds a run; --overwrite_output_dir deletes it, --out names another folder"
             )
+        check_folder(run, args)
+        if not _holds_demo(run) and (there := [name for name in OUTPUTS if (run / name).exists()]):
+            raise ValueError(
+                f"out: {run} has {', '.join(there)}, which no demo wrote: it is kept; --out names another folder"
+            )
     earlier = _holds_demo(out)
-    if not earlier and (there := [name for name in OUTPUTS if (out / name).exists()]):
-        raise ValueError(
-            f"out: {out} has {', '.join(there)}, which no demo wrote: it is kept; --out names another folder"
-        )
     for name in ("base", "gift-i"):
         _copy_embedded(name, out / name, earlier)
     for number, (name, args) in enumerate(arguments.items(), 1):

@@ -142,11 +142,12 @@ def told_of_surface(folder: Path, split: str, group_ids: Iterable[str]) -> list[
     """What the surface targets of a split change, per surface kind: `surface_lines` of their files' headers.
 
     Args:
-        folder: what `make_proxies` returned. split: of the dataset. group_ids: of its groups; those whose targets lie
-            elsewhere, because an earlier version made them, are left out.
+        folder: what `make_proxies` returned. split: of the dataset. group_ids: of its groups; files of an
+            earlier version, which do not tell, are left out.
     """
-    files = ((name, folder / split / f"{name}{SURFACE_SUFFIX}.safetensors") for name in group_ids)
-    return surface_lines((name, read_header(path).get(TOLD, {})) for name, path in files if path.exists())
+    store = ProxyStore(str(folder.parent), folder.name, split, {}, "")
+    files = ((name, store.path(f"{name}{SURFACE_SUFFIX}.safetensors")) for name in group_ids)
+    return surface_lines((name, read_header(path).get(TOLD, {})) for name, path in files)
 
 
 def _is_current(path: Path, expected: dict, command: str, what: str, names: Sequence[str]) -> bool:

@@ -1,7 +1,10 @@
 """Options as they are typed: both spellings of each, the synonyms, the help; what is told of an error."""
 
 import argparse
+import os
 import re
+import subprocess
+import sys
 import warnings
 from importlib import import_module
 
@@ -127,3 +130,21 @@ def test_what_follows_two_hyphens_is_taken_as_it_is():
     parser.add_argument("files", nargs="+")
     args = parser.parse_args(["--out_dir=a_b", "--", "--x_y.jpg", "x_y"])
     assert (args.out_dir, args.files) == ("a_b", ["--x_y.jpg", "x_y"])
+
+
+# Prints OpenMP's settings, as the library says that it has read them, once a verb has imported torch.
+SETTINGS = """
+from gift_peft.options import run_verb
+run_verb(lambda argv: __import__("torch").get_num_threads() and 0, [])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other OpenMP libraries display other words")
+@pytest.mark.parametrize(("given", "expected"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")])
+def test_threads_wait_asleep_unless_told_otherwise(given, expected):
+    """A thread that spins takes a busy core from the one that it waits for; libgomp reads this once, when loaded."""
+    unset = {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}
+    env = {name: value for name, value in os.environ.items() if name not in unset}
+    env |= {"OMP_DISPLAY_ENV": "VERBOSE", **given}
+    done = subprocess.run([sys.executable, "-c", SETTINGS], capture_output=True, text=True, check=True, env=env)
+    assert f"OMP_WAIT_POLICY = '{expected}'" in done.stderr

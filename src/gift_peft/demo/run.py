@@ -5,6 +5,7 @@ depth, and the base was pre-trained on rooms without a mirror or glass (`example
 """
 
 import os
+import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -68,11 +69,12 @@ def run_demo(
             raise ValueError(f"{name}: the demo has its own; choose the folder with --out, or use `gift-peft train`")
     if (out / "metrics.jsonl").exists() and not overwrite_output_dir and not args.resume_from_checkpoint:
         raise ValueError(
-            f"out: {out} already holds a run; --overwrite_output_dir deletes it, --out names another folder"
+            f"out: {out} already holds a run; --resume_from_checkpoint latest goes on with it, --overwrite_output_dir "
+            "deletes it, --out names another folder"
         )
     for name in ("base", "gift-i"):
         _copy_embedded(name, out / name)
-    result = train(args)
+    result = train(args, resume_command=_resume_command(out, seed, extra))
     if result.signal:
         raise KeyboardInterrupt
 
@@ -89,6 +91,14 @@ def run_demo(
     write_whole(out / "report.md", _markdown(reports, args))
     _print_summary(reports, out)
     return reports
+
+
+def _resume_command(out: Path, seed: int, extra: Sequence[str]) -> str:
+    """What goes on with a stopped demo up to its table and pictures; `gift-peft train` would end before them."""
+    words = ["gift-peft", "demo", "--out", str(out), "--seed", str(seed), *extra]
+    if not any(word.replace("_", "-").startswith("--resume-from-checkpoint") for word in extra):
+        words += ["--resume_from_checkpoint", "latest"]
+    return shlex.join(words)
 
 
 def _copy_embedded(name: str, destination: Path) -> None:

@@ -198,7 +198,7 @@ class GiftTrainingArguments:
         "a checkpoint-<step> folder, or latest: the newest complete one in output_dir", None
     )
     booster_root: str | None = _arg("Booster's folder: ToM and Other RMSE on it at every validation", None)
-    report_to: Literal["none", "tensorboard", "trackio"] = _arg("experiment tracker", "none")
+    report_to: Literal["none", "tensorboard", "trackio", "wandb"] = _arg("experiment tracker", "none")
     license: str | None = _arg("licence named in the card; default: the base model's where known", None)
     push_to_hub: bool = _arg("upload the adapter when training has ended (token: hf auth login)", False)
     hub_model_id: str | None = _arg("repository for the upload; default: the name of output_dir", None)

@@ -7,7 +7,7 @@ on) -> finish: the adapter with the smallest validation GCE. With `target: surfa
 
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ from gift_peft.training.start import (
     check_run,
     claim_folder,
     make_accelerator,
+    start_tracker,
     stop_signals,
     tell_lost_processes,
 )
@@ -66,11 +67,14 @@ class TrainResult:
     signal: int | None = None
 
 
-def train(args: GiftTrainingArguments | None = None, **arguments: Any) -> TrainResult:
+def train(
+    args: GiftTrainingArguments | None = None, *, resume_command: str | None = None, **arguments: Any
+) -> TrainResult:
     """Run, or go on with, a training: `train(args)`, or `train(model_name_or_path=..., dataset_name=..., ...)`.
 
     Args:
         args: the arguments as one object.
+        resume_command (*optional*): what is told to type where a signal stops the run; default: `gift-peft train`.
         **arguments: or one by one, under the names of `GiftTrainingArguments`.
 
     Raises:
@@ -85,10 +89,10 @@ def train(args: GiftTrainingArguments | None = None, **arguments: Any) -> TrainR
         raise TypeError(f"train takes GiftTrainingArguments or single arguments, not both: {', '.join(arguments)}")
     accelerator = make_accelerator(args)
     with tell_lost_processes(accelerator, Path(args.output_dir)):
-        return _train(args, accelerator)
+        return _train(args, accelerator, resume_command)
 
 
-def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult:
+def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command: str | None) -> TrainResult:
     # check: what can be known to fail fails before a model is loaded
     output, checkpoint = check_run(args, accelerator)
 
@@ -118,15 +122,14 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
             checkpoint, output, identity, schedule.total_steps, network, optimizer, accelerator
         )
     claim_folder(args, accelerator, fresh=checkpoint is None)
-    if args.report_to != "none":
-        accelerator.init_trackers("gift-peft", {k: str(v) for k, v in asdict(args).items()})
+    start_tracker(args, accelerator)
     trained = sum(p.numel() for p in network.parameters() if p.requires_grad)
     accelerator.print(
         f"{len(train_groups)} train and {len(validation_groups or ())} validation groups at {size[0]}x{size[1]}, "
         f"{schedule.total_steps} updates of {trained / 1e6:.2f} M weights, autocast {accelerator.mixed_precision}"
     )
     if validation_groups is None:
-        accelerator.print("No validation split: adapter/ will be the last adapter, chosen by nothing.")
+        accelerator.print("No validation split: adapter/ will be the last adapter, not the best of several.")
     if checkpoint:
         accelerator.print(f"Going on from {checkpoint} (step {state.step})")
     about = {
@@ -155,7 +158,7 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
 
     # finish
     if signum:
-        accelerator.print(how_to_resume(output, state.step))
+        accelerator.print(how_to_resume(output, state.step, resume_command))
     elif accelerator.is_main_process:
         _finish(args, output, state, save, validated=validation_groups is not None)
     accelerator.end_training()

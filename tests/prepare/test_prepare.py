@@ -388,3 +388,76 @@ def test_proposed_masks_are_used_only_when_accepted(tmp_path):
     found = prepare_gift_i(raw, out)["groups"][0]
     assert found["status"] == "kept" and found["proposal"] is None
     assert "proposed" not in (out / "README.md").read_text() and not (out / "masks_proposed/train/g").exists()
+
+
+def without_masks(folder, seed, count=3, **options):
+    group = capture(folder, seed, count=count, size=SIZE, **options)
+    shutil.rmtree(group / "masks")
+    return group
+
+
+def test_a_weak_proposal_is_accepted_only_where_it_is_asked_for(tmp_path, capsys):
+    """A board on which nothing reflects: photos that differ by a shadow and the camera's noise."""
+    raw, rng = tmp_path / "raw", np.random.default_rng(7)
+    without_masks(raw / "glass", 14)
+    board, y, x = scene(21, SIZE).astype(float), *np.mgrid[: SIZE[0], : SIZE[1]]
+    (raw / "board").mkdir()
+    for index in range(3):
+        away = np.hypot(y - rng.uniform(0, SIZE[0]), x - rng.uniform(0, SIZE[1]))
+        photo = board * (1 - 0.35 * np.exp(-((away / 60) ** 2)))[..., None] + rng.normal(0, 2, board.shape)
+        Image.fromarray(np.clip(photo, 0, 255).astype(np.uint8)).save(raw / "board" / f"{index}.png")
+    accept = PrepareSettings(propose_masks=True, accept_proposed_masks=True)
+    report = prepare_gift_i(raw, tmp_path / "out", accept)
+    board, glass = entry(report, "board"), entry(report, "glass")
+    assert glass["status"] == "kept" and glass["proposal"]["score"] > accept.min_proposal_score
+    assert board["status"] == "rejected" and board["reasons"][0]["code"] == "weak_proposal"
+    assert f"score of {board['proposal']['score']:.2f}" in board["reasons"][0]["text"]
+    assert board["proposal"]["masks"] and not board["proposal"]["accepted"]
+    with pytest.raises(SystemExit) as ended:
+        words = ["--accept-proposed-masks", "--min-proposal-score", "0"]
+        main(["prepare", str(raw), str(tmp_path / "out"), *words])
+    assert ended.value.code == 0
+    said = capsys.readouterr().out
+    assert f"accepted: train/board (score {board['proposal']['score']:.2f}), train/glass (score" in said
+
+
+def test_accepting_masks_does_nothing_twice(tmp_path, monkeypatch):
+    """Groups with drawn masks stay as they are; proposals of the run before are taken as they were looked at."""
+    raw, out = tmp_path / "raw", tmp_path / "out"
+    capture(raw / "drawn", 1, count=2, size=SIZE)
+    without_masks(raw / "bare", 14)
+    first = prepare_gift_i(raw, out, PrepareSettings(propose_masks=True))
+    before = {path: path.stat().st_mtime_ns for path in (out / "train/drawn").rglob("*.png")}
+    looked_at = {path.name: path.read_bytes() for path in (out / "masks_proposed").rglob("*.png")}
+    with monkeypatch.context() as patch:
+        patch.setattr("gift_peft.prepare.proposals.propose", None)  # calling it would be an error
+        accepted = prepare_gift_i(raw, out, PrepareSettings(propose_masks=True, accept_proposed_masks=True))
+    assert entry(accepted, "bare")["status"] == "kept" and len(looked_at) == 3
+    assert before and before == {path: path.stat().st_mtime_ns for path in (out / "train/drawn").rglob("*.png")}
+    assert looked_at == {path.name: path.read_bytes() for path in (out / "masks_proposed").rglob("*.png")}
+    kept = [entry(report, "bare")["proposal"] | {"accepted": None} for report in (first, accepted)]
+    assert kept[0] == kept[1]
+    settings = PrepareSettings(propose_masks=True, accept_proposed_masks=True)
+    again = prepare_gift_i(raw, tmp_path / "fresh", settings)
+    assert {**again, "raw": ""} == {**accepted, "raw": ""}
+
+
+def test_one_observation_and_its_reference_get_a_proposal(tmp_path):
+    raw = tmp_path / "raw"
+    group = capture(raw / "validation/one", 14, count=1, size=SIZE, reference=True)
+    drawn = np.asarray(Image.open(group / "masks/0.png")) > 0
+    shutil.rmtree(group / "masks")
+    without_masks(raw / "validation/alone", 15, count=1)
+    report = prepare_gift_i(raw, tmp_path / "out", PrepareSettings(propose_masks=True))
+    found = entry(report, "one")
+    mask = np.asarray(Image.open(tmp_path / "out" / found["proposal"]["masks"][0])) > 0
+    assert found["reasons"][0]["code"] == "masks_proposed" and (mask & drawn).sum() / (mask | drawn).sum() > 0.6
+    assert entry(report, "alone")["status"] == "rejected"
+
+
+def test_a_bar_of_groups_and_frames_from_the_start(tmp_path, capsys):
+    capture(tmp_path / "raw/a", 1, count=2, size=SIZE)
+    capture(tmp_path / "raw/b", 2, count=3, size=SIZE, reference=True)
+    prepare_gift_i(tmp_path / "raw", tmp_path / "out", num_proc=1)
+    shown = capsys.readouterr().err
+    assert "0/6 [" in shown and "0/2 groups" in shown and "6/6 [" in shown and "2/2 groups" in shown

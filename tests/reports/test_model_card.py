@@ -55,7 +55,7 @@ def make(tmp_path, adapted, **changes):
 
 
 def test_a_card_without_a_countable_group_has_no_nan(tmp_path):
-    """GCE of groups without a pair is NaN: it is no metric of the card, and the card's data stay what JSON can hold."""
+    """GCE of groups without a pair is NaN: no metric of the card, whose data stay what JSON can hold."""
     rows = random_rows([1, 1])
     report = report_of(rows, gce=dict.fromkeys(("base", "adapted", "base_normalized", "adapted_normalized"), math.nan)
                        | {"num_groups": 0, "num_skipped": 2})  # fmt: skip

@@ -92,6 +92,8 @@ def test_a_tracker_that_does_not_start_ends_in_one_line(base_dir, tree, tmp_path
 
     monkeypatch.setattr(start, "find_spec", lambda name: True)
     monkeypatch.setattr(start.Accelerator, "init_trackers", refuse)
-    with pytest.raises(ValueError, match=r"report_to: wandb did not start \(no API key\); WANDB_MODE=offline") as caught:
+    with pytest.raises(
+        ValueError, match=r"report_to: wandb did not start \(no API key\); WANDB_MODE=offline"
+    ) as caught:
         train(arguments(base_dir, tree, tmp_path / "out", max_steps=1, report_to="wandb"))
     assert "\n" not in str(caught.value)

@@ -266,9 +266,10 @@ def _forward(network: Any, pixel_values: torch.Tensor) -> Any:
         if isinstance(error, torch.OutOfMemoryError) or not re.search(r"\bshapes?\b|\bsizes?\b", str(error)):
             raise
         own = getattr(getattr(network, "config", None), "image_size", None)
-        advice = f"its own is --size {own}x{own}" if isinstance(own, int) else "give another --size, a square one perhaps"
+        advice = f"its own is --size {own}x{own}" if isinstance(own, int) else "give a square --size"
         sides = "x".join(map(str, pixel_values.shape[-2:]))
-        raise ValueError(f"the model does not take images of {sides} (height x width): {reason(error)}; {advice}") from error
+        text = f"the model does not take images of {sides} (height x width): {reason(error)}; {advice}"
+        raise ValueError(text) from error
     finally:
         for module in training:
             module.training = True

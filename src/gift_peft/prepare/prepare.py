@@ -22,6 +22,7 @@ from gift_peft.dataset.writer import write_card, write_rows
 from gift_peft.files import write_whole
 from gift_peft.options import package_version
 from gift_peft.prepare.entries import Statistics
+from gift_peft.prepare.frame_bar import FrameBar
 from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import FORMAT, Job, Outcome
 from gift_peft.prepare.out_folder import alone, check_places, side_by_side
@@ -90,8 +91,8 @@ def _make_groups(
     removed = _remove_others(out, records.keys())
     kept = {key: record["row"] for key, record in records.items() if record and record["row"]}
     write_rows(_rows(kept, jobs), out)
-    jobs = [replace(job, known=(records[job.split, job.group_id] or {}).get("digest")) for job in jobs]
-    with tqdm(total=len(jobs), desc="groups", unit="group", disable=None) as bar:
+    jobs = [_with_record(job, records[job.split, job.group_id], out) for job in jobs]
+    with FrameBar(_count_frames(jobs), "prepare") as bar:
         for job, outcome in side_by_side("prepare", prepare_group, jobs, num_proc):
             if outcome.digest is None or outcome.digest != job.known:
                 key = job.split, job.group_id
@@ -102,9 +103,30 @@ def _make_groups(
                     kept[key] = outcome.row
                     write_rows(_rows(kept, jobs), out)
                 records[key] = _write_record(out, job, outcome)
-            bar.update()
+            bar.group_done(job.notes)
     entries = [records[job.split, job.group_id]["entry"] for job in jobs]
     return _report(raw, out, settings, entries, removed), _rows(kept, jobs)
+
+
+def _with_record(job: Job, record: dict | None, out: Path) -> Job:
+    """The job with what an earlier run knows of its group."""
+    if record is None:
+        return job
+    proposal, source = record["entry"].get("proposal"), record.get("proposed_from")
+    proposed = {"from": source, "proposal": proposal, "out": out} if proposal and source else None
+    return replace(job, known=record["digest"], proposed=proposed)
+
+
+def _count_frames(jobs: list[Job]) -> dict[Path, int]:
+    """{file of a group's notes: its number of frames}; a group that cannot be read is one frame's work."""
+    counts = {}
+    for job in tqdm(jobs, desc="looking through RAW", unit="group", disable=None, leave=False, delay=0.5):
+        try:
+            capture = job.read()
+            counts[job.notes] = len(capture.images) + (capture.reference is not None)
+        except (OSError, ValueError, RecursionError):  # its own job says what is wrong
+            counts[job.notes] = 1
+    return counts
 
 
 def _check_names(jobs: list[Job]) -> None:

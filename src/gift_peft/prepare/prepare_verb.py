@@ -35,6 +35,10 @@ def run(argv: Sequence[str]) -> int:
         if entry["status"] == "rejected":
             text = entry["reasons"][0]["text"]
             print(f"gift-peft: rejected: {entry['split']}/{entry['group_id']}: {text}", file=sys.stderr)
+    accepted = [entry for entry in report["groups"] if entry["status"] == "kept" and entry["proposal"]]
+    if accepted:
+        names = ", ".join(f"{e['split']}/{e['group_id']} (score {e['proposal']['score']:.2f})" for e in accepted)
+        print(f"Masks that were proposed, not drawn, and accepted: {names}")
     for split, found in report["statistics"].items():
         print(
             f"{split}: {found['groups']} groups, {found['images']} images ({found['warped_frames']} frames warped, "

@@ -88,6 +88,7 @@ class PrepareSettings:
         "propose masks for groups that lack any, into OUT/masks_proposed; they are not used", False
     )
     accept_proposed_masks: bool = _arg("use the proposed masks, which the dataset card then says", False)
+    min_proposal_score: float = _arg("score (0 to 1) below which a proposed mask is never accepted", 0.5)
     refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
     layout: Layout | None = field(
         default=None, metadata=_option("YAML file that says where RGB and mask files lie", metavar="FILE")

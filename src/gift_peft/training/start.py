@@ -91,10 +91,8 @@ def tell_missing_processes(num_processes: int) -> None:
         program, words = "-m gift_peft.training", words[1:] if words[:1] == ["train"] else words
     cpu = "ACCELERATE_USE_CPU=true " if parse_flag_from_env("ACCELERATE_USE_CPU") else ""
     command = f"{cpu}torchrun --nproc_per_node {number} {program} {shlex.join(words)}".strip()
-    print(
-        f"gift-peft: warning: the launcher announces {count}, and {num_processes} is at work; start them with  {command}",
-        file=sys.stderr,
-    )
+    text = f"the launcher announces {count}, and {num_processes} is at work; start them with  {command}"
+    print(f"gift-peft: warning: {text}", file=sys.stderr)
 
 
 def _asked_of_accelerate() -> float:

@@ -12,6 +12,7 @@ import pytest
 
 from gift_peft.cli import VERBS
 from gift_peft.options import OptionParser, run_verb
+from gift_peft.training import arguments
 
 SYNONYMS = {
     "--base": "--model-name-or-path",
@@ -130,6 +131,35 @@ def test_what_follows_two_hyphens_is_taken_as_it_is():
     parser.add_argument("files", nargs="+")
     args = parser.parse_args(["--out_dir=a_b", "--", "--x_y.jpg", "x_y"])
     assert (args.out_dir, args.files) == ("a_b", ["--x_y.jpg", "x_y"])
+
+
+def test_a_misspelled_option_is_told_with_the_nearest(parser, monkeypatch):
+    """Also where a required one is missing because it is the one that is misspelled."""
+    for option, _ in options(parser):
+        wrong = f"{option[:-2]}{option[-1]}{option[-2]}x"
+        if len(option) < 8 or parser.knows(wrong):
+            continue
+        with pytest.raises(ValueError, match=f"unknown option {wrong}; did you mean --") as told:
+            parser.parse_args([wrong, "3"])
+        nearest = str(told.value).split("did you mean ")[1].rstrip("?")
+        assert parser.knows(nearest)
+    with pytest.raises(ValueError, match=r"unknown option --qqqqzzzz$"):
+        parser.parse_args(["--qqqqzzzz=3"])
+
+
+def test_what_follows_two_hyphens_is_no_option():
+    parser = OptionParser("try", "Try.", "gift-peft try")
+    parser.add_argument("names", nargs="*")
+    assert parser.parse_args(["--", "--what"]).names == ["--what"]
+
+
+def test_the_help_of_train_has_every_argument_in_one_group():
+    text = arguments.make_parser().format_help()
+    start = [text.index(f"\n{title}:\n") for title in arguments.SECTIONS.values()]
+    assert start == sorted(start) and set(arguments.SECTIONS) <= set(arguments._names())
+    for name in arguments._names():
+        assert len(re.findall(rf"^  --{name.replace('_', '-')}\b", text, re.MULTILINE)) == 1
+    assert text.index("--model-name-or-path") > start[0] and "--base ID --dataset ID --out DIR [options]" in text
 
 
 # Prints OpenMP's settings, as the library says that it has read them, once a verb has imported torch.

@@ -6,11 +6,12 @@ code. Only the standard library is imported here: `--help` waits for nothing els
 
 import argparse
 import copy
+import difflib
 import math
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import metadata
 
 
@@ -42,10 +43,20 @@ class OptionParser(argparse.ArgumentParser):
     def knows(self, option: str) -> bool:
         return _hyphens(option) in self._option_string_actions
 
+    def parse_args(self, args=None, namespace=None):
+        words = list(sys.argv[1:] if args is None else args)
+        # Before argparse, which would complain of a required option where its name is merely misspelled.
+        for word in before_separator(words):
+            option = _hyphens(word).partition("=")[0]
+            if option.startswith("--") and not self.knows(option):
+                known = [name for name in self._option_string_actions if name.startswith("--")]
+                self.error(f"unknown option {word.partition('=')[0]}{did_you_mean(option, known)}")
+        return super().parse_args(words, namespace)
+
     def parse_known_args(self, args=None, namespace=None):
         words = list(sys.argv[1:] if args is None else args)
-        end = words.index("--") if "--" in words else len(words)  # what follows is no option, whatever it looks like
-        return super().parse_known_args([*map(_hyphens, words[:end]), *words[end:]], namespace)
+        options = before_separator(words)
+        return super().parse_known_args([*map(_hyphens, options), *words[len(options) :]], namespace)
 
 
 class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
@@ -56,6 +67,17 @@ class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescrip
             action = copy.copy(action)
             action.default = argparse.SUPPRESS
         super().add_argument(action)
+
+
+def before_separator(words: Sequence[str]) -> Sequence[str]:
+    """Those before a `--`: what follows is no option, whatever it looks like."""
+    return words[: words.index("--")] if "--" in words else words
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The end of a message about an unknown word: "; did you mean X?", or nothing where none is near."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _hyphens(word: str) -> str:

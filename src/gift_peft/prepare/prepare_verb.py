@@ -4,7 +4,6 @@ A YAML file (`--config`) may state the same names; the command line wins.
 """
 
 import argparse
-import difflib
 import sys
 from collections.abc import Sequence
 from dataclasses import Field, fields
@@ -12,7 +11,7 @@ from pathlib import Path
 
 from gift_peft.captures.foreign import read_layout
 from gift_peft.files import read_yaml
-from gift_peft.options import OptionParser, number
+from gift_peft.options import OptionParser, did_you_mean, number
 from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
 
 PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
@@ -111,8 +110,7 @@ def _read_config(path: Path) -> list[str]:
     words = []
     for key, value in read_yaml(path, f"config {path}").items():
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            refuse(f"unknown key {key!r}" + (f"; did you mean {near[0]}?" if near else ""))
+            refuse(f"unknown key {key!r}{did_you_mean(str(key), known)}")
         flag = isinstance(known[key], bool)
         if isinstance(value, list | dict) or flag != isinstance(value, bool):
             refuse(f"{key}: {value!r}; expected {'true or false' if flag else 'one value'}")

@@ -158,7 +158,7 @@ def test_the_help_of_train_has_every_argument_in_one_group():
     start = [text.index(f"\n{title}:\n") for title in arguments.SECTIONS.values()]
     assert start == sorted(start) and set(arguments.SECTIONS) <= set(arguments._names())
     for name in arguments._names():
-        assert len(re.findall(rf"^  --{name.replace('_', '-')}\b", text, re.MULTILINE)) == 1
+        assert len(re.findall(rf"^  --{name.replace('_', '-')}(?![\w-])", text, re.MULTILINE)) == 1
     assert text.index("--model-name-or-path") > start[0] and "--base ID --dataset ID --out DIR [options]" in text
 
 

@@ -63,11 +63,8 @@ def prepare_gift_i(
     settings = settings or PrepareSettings()
     if num_proc < 1:
         raise ValueError(f"num_proc: at least 1, got {num_proc}")
-    check_places("prepare", raw, "RAW", out, STATE)
-    groups = settings.layout.find(raw) if settings.layout is not None else find_groups(raw)
+    jobs = list_jobs(raw, out, settings)
     staging = out / STATE / "staging"
-    jobs = [Job(raw, staging, source, split, settings) for split in SPLITS for source in groups.get(split, [])]
-    _check_names(jobs)
     with alone("prepare", out, STATE):
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir()
@@ -83,6 +80,19 @@ def prepare_gift_i(
     return report
 
 
+def list_jobs(raw: Path, out: Path, settings: PrepareSettings) -> list[Job]:
+    """Every group of RAW, with what an earlier run knows of it; nothing is written.
+
+    Raises ValueError or FileNotFoundError: `raw` or `out` is not what it should be, or two groups have one name.
+    """
+    check_places("prepare", raw, "RAW", out, STATE)
+    groups = settings.layout.find(raw) if settings.layout is not None else find_groups(raw)
+    staging = out / STATE / "staging"
+    jobs = [Job(raw, staging, source, split, settings) for split in SPLITS for source in groups.get(split, [])]
+    _check_names(jobs)
+    return [_with_record(job, _read_record(out, job), out) for job in jobs]
+
+
 def _make_groups(
     raw: Path, out: Path, settings: PrepareSettings, jobs: list[Job], num_proc: int
 ) -> tuple[dict, dict[str, dict[str, dict]]]:
@@ -91,7 +101,6 @@ def _make_groups(
     removed = _remove_others(out, records.keys())
     kept = {key: record["row"] for key, record in records.items() if record and record["row"]}
     write_rows(_rows(kept, jobs), out)
-    jobs = [_with_record(job, records[job.split, job.group_id], out) for job in jobs]
     with FrameBar(_count_frames(jobs), "prepare") as bar:
         for job, outcome in side_by_side("prepare", prepare_group, jobs, num_proc):
             if outcome.digest is None or outcome.digest != job.known:

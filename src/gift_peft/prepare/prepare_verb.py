@@ -27,6 +27,10 @@ def run(argv: Sequence[str]) -> int:
     Raises ValueError or an OSError (one line) where nothing could be made; a wrong command line leaves by SystemExit.
     """
     args = parse_arguments(argv)
+    if args.__dict__.pop("dry_run"):
+        from gift_peft.prepare.prepare_plan import tell_plan
+
+        return tell_plan(Path(args.raw), Path(args.out), args.settings, args.num_proc)
     from gift_peft.prepare.prepare import prepare_gift_i
 
     report = prepare_gift_i(**vars(args))
@@ -76,6 +80,8 @@ def make_parser() -> OptionParser:
     parser.add_argument("raw", metavar="RAW", help="folder of group folders; it is only read")
     parser.add_argument("out", metavar="OUT", help="prepared folder: new, or made by this command before")
     parser.add_argument("--config", metavar="FILE", help="YAML file with values for the options below")
+    text = "say what would be done and how long it takes, and write nothing; the exit code is that of the run"
+    parser.add_argument("--dry-run", action="store_true", help=text)
     parser.add_argument("--num-proc", type=number(int, 1), default=1, metavar="N", help="groups prepared side by side")
     parser.add_argument("--license", default="unknown", metavar="ID", help="for the dataset card, as cc-by-4.0")
     parser.add_argument("--pretty-name", metavar="NAME", help="for the dataset card; default: the name of RAW")
@@ -105,7 +111,7 @@ def _read_config(path: Path) -> list[str]:
     parser = make_parser()
     parser.error = refuse
     known = vars(parser.parse_args(["RAW", "OUT"]))
-    for key in ("raw", "out", "config"):
+    for key in ("raw", "out", "config", "dry_run"):
         del known[key]
     words = []
     for key, value in read_yaml(path, f"config {path}").items():

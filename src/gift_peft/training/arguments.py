@@ -298,6 +298,8 @@ def make_parser() -> OptionParser:
         "gift-peft train --base depth-anything/Depth-Anything-V2-Small-hf --dataset gift-i --out run",
         parents=[_hf_argument_parser()(GiftTrainingArguments, add_help=False)],
     )
+    text = "say what a run would do, need and miss, and write nothing; exit code 1 if it would fail"
+    parser.add_argument("--dry-run", action="store_true", help=text)
     # HfArgumentParser knows no groups, so its options are moved into them.
     parser.usage = "%(prog)s --base ID --dataset ID --out DIR [options]"
     actions = {action.dest: action for action in parser._actions}
@@ -338,6 +340,8 @@ def parse_arguments(argv: Sequence[str]) -> GiftTrainingArguments:
     values, unknown = parser.parse_known_args([*from_file, *argv])
     if unknown:
         raise ValueError(f"unknown argument {unknown[0]}")
+    if values.dry_run:  # `run` of the verb has taken it out
+        raise ValueError("dry_run: only `gift-peft train` has it")
     return GiftTrainingArguments(**{name: getattr(values, name) for name in _names()})
 
 

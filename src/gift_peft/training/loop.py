@@ -98,7 +98,7 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command
 
     # load: float32 weights whatever the checkpoint's, bf16 is autocast's business (paper, implementation details)
     base, processor = load_base(args.model_name_or_path, args.model_revision)
-    recipe, kind = _recipe(args, base)
+    recipe, kind = find_recipe(args, base)
     size = resolve_size(args.size, recipe, processor, base.config)
 
     # data
@@ -107,7 +107,7 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command
     identity = checkpoints.run_identity(args, [part.dataset for part in groups.values()], size, accelerator)
 
     # objective
-    network, optimizer = _adapted(args, base, recipe, accelerator)
+    network, optimizer = adapt(args, base, recipe, accelerator)
     objective = OBJECTIVES[args.target](args, train_groups, network, optimizer, accelerator)
     optimizer, schedule = objective.optimizer, Schedule(args, objective.epoch_steps)
     if args.profile:
@@ -165,7 +165,7 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command
     return TrainResult(output, state.step, state.rows, state.best_step, signum or None)
 
 
-def _recipe(args: GiftTrainingArguments, base: torch.nn.Module) -> tuple[GiftRecipe, str]:
+def find_recipe(args: GiftTrainingArguments, base: torch.nn.Module) -> tuple[GiftRecipe, str]:
     """(recipe, what the model predicts): the one the arguments spell out, else the one for the model's type."""
     spelled = None
     if args.target_modules:
@@ -211,7 +211,7 @@ def _groups(
     return groups
 
 
-def _adapted(
+def adapt(
     args: GiftTrainingArguments, base: torch.nn.Module, recipe: GiftRecipe, accelerator: Accelerator
 ) -> tuple[PeftModel, torch.optim.Adam]:
     """The base with a fresh adapter, and its optimizer."""

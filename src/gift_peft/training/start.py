@@ -105,8 +105,10 @@ def _asked_of_accelerate() -> float:
     return int(value) if value.isdigit() else math.inf
 
 
-def check_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Path, Path | None]:
+def check_run(args: GiftTrainingArguments, accelerator: Accelerator, prepare: bool = True) -> tuple[Path, Path | None]:
     """(output folder, checkpoint to go on from or None). Changes nothing but leftovers of a killed run.
+
+    Without `prepare` not even those are removed, nor the output folder made.
 
     Raises ValueError if the folder holds a run that the arguments neither resume nor overwrite, OSError if it cannot
     be written, and either for a bad Booster root.
@@ -115,7 +117,7 @@ def check_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Pa
     check_push(args)
     if output.exists() and not output.is_dir():
         raise ValueError(f"output_dir: {output} is a file")
-    if accelerator.is_main_process and output.is_dir():
+    if prepare and accelerator.is_main_process and output.is_dir():
         remove_leftovers(output)
     accelerator.wait_for_everyone()
     checkpoint = None
@@ -131,8 +133,10 @@ def check_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Pa
             f"output_dir: {output} already holds a run; --resume_from_checkpoint latest goes on with it, "
             "--overwrite_output_dir deletes it"
         )
-    output.mkdir(parents=True, exist_ok=True)
-    if not os.access(output, os.W_OK):
+    if prepare:
+        output.mkdir(parents=True, exist_ok=True)
+    place = next(folder for folder in (output.absolute(), *output.absolute().parents) if folder.exists())
+    if not os.access(place, os.W_OK):
         raise PermissionError(f"output_dir: {output} cannot be written")
     if args.booster_root is not None:
         find_booster(args.booster_root)

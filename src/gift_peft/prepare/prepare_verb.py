@@ -26,8 +26,9 @@ def run(argv: Sequence[str]) -> int:
 
     Raises ValueError or an OSError (one line) where nothing could be made; a wrong command line leaves by SystemExit.
     """
-    args = parse_arguments(argv)
-    if args.__dict__.pop("dry_run"):
+    words = [word for word in argv if word.replace("_", "-") != "--dry-run"]
+    args = parse_arguments(words)
+    if len(words) < len(argv):
         from gift_peft.prepare.prepare_plan import tell_plan
 
         return tell_plan(Path(args.raw), Path(args.out), args.settings, args.num_proc)
@@ -66,7 +67,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     values = vars(parser.parse_args(argv))
     if values["config"] is not None:
         values = vars(parser.parse_args([*_read_config(Path(values["config"])), *argv]))
-    del values["config"]
+    del values["config"], values["dry_run"]  # `run` has looked for the second
     parts = {name: kind(**{key: values.pop(key) for key in _options(kind)}) for name, kind in PARTS.items()}
     choices = {key: values.pop(key) for key in _options(PrepareSettings)}
     choices["propose_masks"] |= choices["accept_proposed_masks"] or choices["refine"] is not None

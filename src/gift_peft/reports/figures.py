@@ -155,7 +155,7 @@ def error_row(panel: Panel) -> GridRow:
     high = color_range(*errors)[1]
     tiles = [_picture(panel), *(colorize_error(error, high) for error in errors)]
     colors = colorize_error(np.linspace(0, high, 256)[None], high)
-    bar = ColorBar(colors, "no error", f"{_in_units(high, aligned.unit)} or more")
+    bar = ColorBar(colors, "no error", f"{_in_units(high, aligned.unit)} or more{_unit(aligned.unit)}")
     return GridRow(_caption(panel, aligned), tiles, bar, panel.target)
 
 
@@ -175,15 +175,15 @@ def _caption(panel: Panel, aligned: Aligned) -> str:
     scores = "unknown"
     if not np.isnan(aligned.errors).any():
         before, after = (_in_units(error, aligned.unit) for error in aligned.errors)
-        scores = f"{before} before, {after} after"
-    return f"{panel.label}   RMSE in the outline: {scores}"
+        scores = f"{before} before, {after} after{_unit(aligned.unit)}"
+    return f"{panel.label} · RMSE in the outline: {scores}"
 
 
 def _bar(low: float, high: float, kind: str, unit: str) -> ColorBar:
     """From near to far, whatever is larger in this kind of prediction."""
     near, far = (high, low) if kind == "inverse_depth" else (low, high)
     colors = colorize(np.linspace(near, far, 256)[None], low, high, kind)
-    return ColorBar(colors, f"near: {_in_units(near, unit)}", f"far: {_in_units(far, unit)}")
+    return ColorBar(colors, f"near: {_in_units(near, unit)}", f"far: {_in_units(far, unit)}{_unit(unit)}")
 
 
 def _in_units(value: float, unit: str) -> str:
@@ -191,7 +191,12 @@ def _in_units(value: float, unit: str) -> str:
     if unit == MILLIMETERS:
         return f"{value:,.0f} mm"
     digits = 0 if value == 0 else math.floor(math.log10(abs(value)))
-    return f"{value:,.{min(max(2 - digits, 0), 6)}f} {unit}"
+    return f"{value:,.{min(max(2 - digits, 0), 6)}f}"
+
+
+def _unit(unit: str) -> str:
+    """What follows the last of several numbers: millimeters stand behind each, the model's units once."""
+    return "" if unit == MILLIMETERS else f" {unit}"
 
 
 # ---- drawing ----

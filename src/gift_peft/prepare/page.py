@@ -274,7 +274,7 @@ def _figures(frames: list[dict]) -> str:
         cells += [_verdict(found.get("paper_exact"))] if exact else []
         rows.append([frame["name"], *cells, *(_measured(key, quality.get(key)) for key in measured)])
     head = ["frame", *(heading for heading, _ in FIGURES.values()), *(["the paper's rule alone"] if exact else [])]
-    head += [f"{QUALITY[key][0]}{' (%)' if QUALITY[key][1] == '%' else ''}" for key in measured]
+    head += [QUALITY[key][0] for key in measured]
     meanings = " · ".join(f"<b>{_text(word)}</b>: {_text(meaning)}" for word, meaning in MEANINGS.items())
     return f'<details><summary>Figures</summary>{_table(head, rows)}<p class="facts">{meanings}</p></details>'
 
@@ -382,8 +382,10 @@ def _number(value, form: str = ".3g") -> str:
 
 def _measured(key: str, value: float | None) -> str:
     """A figure of quality in its unit."""
-    form = QUALITY[key][1]
-    return _number(value, form) if form != "%" or value is None else f"{_number(100 * value)} %"
+    unit = QUALITY[key][1]
+    if value is None or unit.startswith("."):
+        return _number(value, unit)
+    return f"{_number(100 * value)} %" if unit == "%" else f"{_number(value, '.1f')} {unit}"
 
 
 def _text(value) -> str:

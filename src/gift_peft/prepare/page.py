@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from gift_peft.files import write_whole
 from gift_peft.images import jpeg_uri, open_image
+from gift_peft.prepare.quality import plain_number
 
 WIDTH = 240  # of the thumbnails as they are shown, in pixels
 LARGEST = 960  # of a picture in the file, which is shown when it is clicked
@@ -374,10 +375,7 @@ def _number(value, form: str = ".3g") -> str:
         return "–"
     if not isinstance(value, int | float) or form == "s":
         return str(value)
-    text = format(round(value) if form == "d" else value, form)
-    if "e" in text:
-        text = f"{value:.0f}" if abs(value) >= 1 else f"{value:.6f}".rstrip("0").rstrip(".")
-    return text
+    return plain_number(value) if form == ".3g" else format(round(value) if form == "d" else value, form)
 
 
 def _measured(key: str, value: float | None) -> str:

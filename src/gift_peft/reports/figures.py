@@ -127,14 +127,18 @@ def before_after(
     return save_grid([panel_row(panel) for panel in rows], columns, path)
 
 
-def panel_row(panel: Panel) -> GridRow:
-    """RGB, reference, base and adapted of one panel as coloured tiles."""
-    aligned = align_panel(panel)
-    maps = (aligned.reference, aligned.base, aligned.adapted)
+def panel_row(panel: Panel, *others: Panel) -> GridRow:
+    """RGB, reference, base and adapted of one panel as coloured tiles.
+
+    `others`: the same picture, reference and base with other adapted predictions, each one tile more.
+    """
+    aligned, more = align_panel(panel), [align_panel(other) for other in others]
+    maps = (aligned.reference, aligned.base, aligned.adapted, *(other.adapted for other in more))
     low, high = color_range(*maps)
     tiles = [colorize(depth, low, high, aligned.kind) for depth in maps]
+    errors = (*aligned.errors, *(other.errors[1] for other in more))
     bar = _bar(low, high, aligned.kind, aligned.unit)
-    return GridRow(_caption(panel, aligned), [_picture(panel), *tiles], bar, panel.target)
+    return GridRow(_caption(panel.label, errors, aligned.unit), [_picture(panel), *tiles], bar, panel.target)
 
 
 def error_maps(
@@ -156,7 +160,7 @@ def error_row(panel: Panel) -> GridRow:
     tiles = [_picture(panel), *(colorize_error(error, high) for error in errors)]
     colors = colorize_error(np.linspace(0, high, 256)[None], high)
     bar = ColorBar(colors, "no error", f"{_in_units(high, aligned.unit)} or more{_unit(aligned.unit)}")
-    return GridRow(_caption(panel, aligned), tiles, bar, panel.target)
+    return GridRow(_caption(panel.label, aligned.errors, aligned.unit), tiles, bar, panel.target)
 
 
 def prediction_row(label: str, image: Image.Image, predictions: Sequence[np.ndarray], kind: str) -> GridRow:
@@ -170,13 +174,13 @@ def _picture(panel: Panel) -> np.ndarray:
     return np.asarray(panel.image.convert("RGB"))
 
 
-def _caption(panel: Panel, aligned: Aligned) -> str:
-    """What the row shows, and the error before and after."""
+def _caption(label: str, errors: Sequence[float], unit: str) -> str:
+    """What the row shows, and the error of the base and of each adapted prediction."""
     scores = "unknown"
-    if not np.isnan(aligned.errors).any():
-        before, after = (_in_units(error, aligned.unit) for error in aligned.errors)
-        scores = f"{before} before, {after} after{_unit(aligned.unit)}"
-    return f"{panel.label} · RMSE in the outline: {scores}"
+    if not np.isnan(errors).any():
+        before, *after = (_in_units(error, unit) for error in errors)
+        scores = f"{before} before, {' and '.join(after)} after{_unit(unit)}"
+    return f"{label} · RMSE in the outline: {scores}"
 
 
 def _bar(low: float, high: float, kind: str, unit: str) -> ColorBar:

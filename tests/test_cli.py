@@ -107,6 +107,22 @@ def test_wrong_usage_is_2(argv, run):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
+        (["trian"], "unknown verb 'trian'; did you mean train?"),
+        (["evalute", "--base", "b"], "unknown verb 'evalute'; did you mean evaluate?"),
+        (["xyzzy"], "unknown verb 'xyzzy' (gift-peft --help lists them)"),
+        (["predict", "a.png", "--bse", "b", "--out", "o"], "unknown option --bse; did you mean --base?"),
+        (["evaluate", "--protocl=gift"], "unknown option --protocl; did you mean --protocol?"),
+        (["prepare", "r", "o", "--static_rigg"], "unknown option --static_rigg; did you mean --static-rig?"),
+    ],
+)
+def test_a_misspelled_word_gets_the_nearest_one(argv, message, run):
+    code, _, err = run(*argv)
+    assert code == 2 and message in err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
         (["train", "--lora_rnk=3"], "unknown argument --lora_rnk; did you mean lora_rank?"),
         (["train", "--config", "nowhere.yaml"], "config nowhere.yaml: no such file"),
         (["train", "--mixed_precision", "fp16", *train_arguments("b", "d", "o")], "mixed_precision: fp16"),

@@ -1,7 +1,10 @@
 """Options as they are typed: both spellings of each, the synonyms, the help; what is told of an error."""
 
 import argparse
+import os
 import re
+import subprocess
+import sys
 import warnings
 from importlib import import_module
 from pathlib import Path
@@ -10,6 +13,7 @@ import pytest
 
 from gift_peft.cli import VERBS
 from gift_peft.options import OptionParser, expand_home, run_verb
+from gift_peft.training import arguments
 
 SYNONYMS = {
     "--base": "--model-name-or-path",
@@ -151,3 +155,50 @@ def test_only_a_leading_tilde_is_the_home_folder(monkeypatch):
     words = ["~", "~/a", "a~", "/x/~/y", "~nobody-has-this-name/x", "", Path("~/a"), ["~/a", 3], None, 1.5]
     expected = ["/home/me", "/home/me/a", "a~", "/x/~/y", "~nobody-has-this-name/x", "", Path("/home/me/a")]
     assert expand_home(words) == [*expected, ["/home/me/a", 3], None, 1.5]
+
+
+def test_a_misspelled_option_is_told_with_the_nearest(parser, monkeypatch):
+    """Also where a required one is missing because it is the one that is misspelled."""
+    for option, _ in options(parser):
+        wrong = f"{option[:-2]}{option[-1]}{option[-2]}x"
+        if len(option) < 8 or parser.knows(wrong):
+            continue
+        with pytest.raises(ValueError, match=f"unknown option {wrong}; did you mean --") as told:
+            parser.parse_args([wrong, "3"])
+        nearest = str(told.value).split("did you mean ")[1].rstrip("?")
+        assert parser.knows(nearest)
+    with pytest.raises(ValueError, match=r"unknown option --qqqqzzzz$"):
+        parser.parse_args(["--qqqqzzzz=3"])
+
+
+def test_what_follows_two_hyphens_is_no_option():
+    parser = OptionParser("try", "Try.", "gift-peft try")
+    parser.add_argument("names", nargs="*")
+    assert parser.parse_args(["--", "--what"]).names == ["--what"]
+
+
+def test_the_help_of_train_has_every_argument_in_one_group():
+    text = arguments.make_parser().format_help()
+    start = [text.index(f"\n{title}:\n") for title in arguments.SECTIONS.values()]
+    assert start == sorted(start) and set(arguments.SECTIONS) <= set(arguments._names())
+    for name in arguments._names():
+        assert len(re.findall(rf"^  --{name.replace('_', '-')}(?![\w-])", text, re.MULTILINE)) == 1
+    assert text.index("--model-name-or-path") > start[0] and "--base ID --dataset ID --out DIR [options]" in text
+
+
+# Prints OpenMP's settings, as the library says that it has read them, once a verb has imported torch.
+SETTINGS = """
+from gift_peft.options import run_verb
+run_verb(lambda argv: __import__("torch").get_num_threads() and 0, [])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other OpenMP libraries display other words")
+@pytest.mark.parametrize(("given", "expected"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")])
+def test_threads_wait_asleep_unless_told_otherwise(given, expected):
+    """A thread that spins takes a busy core from the one that it waits for; libgomp reads this once, when loaded."""
+    unset = {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}
+    env = {name: value for name, value in os.environ.items() if name not in unset}
+    env |= {"OMP_DISPLAY_ENV": "VERBOSE", **given}
+    done = subprocess.run([sys.executable, "-c", SETTINGS], capture_output=True, text=True, check=True, env=env)
+    assert f"OMP_WAIT_POLICY = '{expected}'" in done.stderr

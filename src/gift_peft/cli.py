@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from gift_peft.options import package_version, run_verb
+from gift_peft.options import did_you_mean, package_version, run_verb
 
 VERBS = {
     "demo": ("demo.demo_verb", "train and evaluate the embedded model on the embedded groups"),
@@ -27,7 +27,10 @@ PACKAGES = ("torch", "transformers", "peft", "accelerate", "datasets")
 def main(argv: Sequence[str] | None = None) -> None:
     """Run a verb and leave through `sys.exit`."""
     argv = sys.argv[1:] if argv is None else argv
-    module, _ = VERBS[_parser().parse_args(argv[:1]).verb]
+    parser = _parser()
+    if argv and not argv[0].startswith("-") and argv[0] not in VERBS:
+        parser.error(f"unknown verb {argv[0]!r}{did_you_mean(argv[0], VERBS)} (gift-peft --help lists them)")
+    module, _ = VERBS[parser.parse_args(argv[:1]).verb]
     sys.exit(run_verb(lambda words: import_module(f"gift_peft.{module}").run(words), argv[1:]))
 
 

@@ -2,6 +2,8 @@
 
 import json
 import os
+import shlex
+import signal
 from importlib.resources import files
 from pathlib import Path
 
@@ -12,11 +14,12 @@ from helpers.tiny import write_base
 from PIL import Image
 from transformers import AutoModelForDepthEstimation
 
-from gift_peft import load_gift_i
+from gift_peft import cli, load_gift_i
 from gift_peft.dataset.export import export_parquet
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.demo import run
 from gift_peft.demo.side_by_side import KINDS as KIND_LABELS
+from gift_peft.training.progress import Progress
 
 KINDS = ("mirror", "pane", "solid")
 
@@ -81,7 +84,7 @@ def test_demo_leaves_everything_it_promises(embedded, tmp_path, monkeypatch, cap
     model = AutoModelForDepthEstimation.from_pretrained("demo/adapter").eval()
     assert torch.isfinite(model(torch.zeros(1, 3, 112, 140)).predicted_depth).all()
 
-    with pytest.raises(ValueError, match=r"demo already holds a run; --overwrite_output_dir"):
+    with pytest.raises(ValueError, match=r"demo already holds a run; --resume_from_checkpoint latest"):
         run.run_demo("demo")
     assert "channels_last: true" in Path("demo/config.yaml").read_text()
     run.run_demo("demo", overwrite_output_dir=True, seed=1, extra=["--max_steps=1", "--head=lora"])
@@ -127,7 +130,7 @@ def test_one_target_alone_is_the_demo(embedded, tmp_path, monkeypatch, capsys, t
 def test_the_demo_is_channels_last_where_it_can_and_may_be(embedded, tmp_path, monkeypatch, options, channels_last):
     asked = []
 
-    def stop(args):
+    def stop(args, **told):
         asked.append(args)
         raise InterruptedError
 
@@ -175,6 +178,25 @@ def test_a_demo_again_replaces_its_own_and_nothing_added(embedded, tmp_path, mon
     (tmp_path / "demo/base/notes.txt").unlink()
     run._copy_embedded("base", Path("demo/base"), earlier=True)
     assert contents(tmp_path / "demo/base") == contents(embedded / "base") != before
+
+
+def test_a_stopped_demo_says_how_to_go_on_up_to_table_and_picture(embedded, tmp_path, monkeypatch, capsys):
+    out, step = tmp_path / "my demo", Progress.step
+
+    def step_and_stop(self, *losses):
+        step(self, *losses)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Progress, "step", step_and_stop)
+        run.run_demo(out, seed=3, extra=["--num_train_epochs=2"])
+    told = capsys.readouterr().out.splitlines()[-1]
+    words = shlex.split(told)
+    assert words[:2] == ["gift-peft", "demo"] and "--num_train_epochs=2" in words and not (out / "report.md").exists()
+    with pytest.raises(SystemExit) as left:
+        cli.main(words[1:])
+    assert left.value.code == 0 and "seed 3" in (out / "report.md").read_text()
+    assert (out / "before_after.png").is_file() and (out / "validation.html").is_file()
 
 
 @pytest.mark.parametrize("argument", ["--output_dir=x", "--dataset_name=mine", "--model_name_or_path=x/base"])

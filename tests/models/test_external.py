@@ -152,8 +152,8 @@ def test_what_is_missing_or_wrong_is_one_line(packages, monkeypatch):
 # ---- architectures of transformers without a recipe ----
 
 
-def test_any_depth_model_of_transformers_is_a_base(tmp_path):
-    base = tmp_path / "dpt"
+def write_dpt(base):
+    """A tiny random DPT as a transformers folder."""
     config = DPTConfig(
         hidden_size=16, num_hidden_layers=4, num_attention_heads=2, intermediate_size=32, image_size=64, patch_size=16,
         backbone_out_indices=[0, 1, 2, 3], neck_hidden_sizes=[8, 8, 8, 8], fusion_hidden_size=8, is_hybrid=False,
@@ -161,12 +161,30 @@ def test_any_depth_model_of_transformers_is_a_base(tmp_path):
     torch.manual_seed(0)
     DPTForDepthEstimation(config).save_pretrained(base)
     DPTImageProcessorPil(size={"height": 64, "width": 96}).save_pretrained(base)
+
+
+def test_any_depth_model_of_transformers_is_a_base(tmp_path):
+    base = tmp_path / "dpt"
+    write_dpt(base)
     write_root(tmp_path)
     options = {"out": tmp_path / "out", "progress": False, "size": "64x64"}
     with pytest.raises(ValueError, match='no recipe says what dpt predicts: kind="depth"'):
         run_evaluation(base, booster=tmp_path, **options)
     report = run_evaluation(base, booster=tmp_path, kind="inverse_depth", **options)
     assert report.counts["scored"] == 4 and report.about["kind"] == "inverse_depth"
+
+
+@pytest.mark.parametrize("size", ["64x96", "96x64", "112x80"])
+def test_sides_that_an_architecture_does_not_take_are_one_line(tmp_path, size):
+    """DPT's own encoder takes squares only, whatever its patch size divides."""
+    base = tmp_path / "dpt"
+    write_dpt(base)
+    Image.new("RGB", (40, 30)).save(tmp_path / "photo.png")
+    model = DepthModel.from_pretrained(base, kind="inverse_depth", size=size)
+    with pytest.raises(ValueError, match=rf"does not take images of {size} \(height x width\).*--size 64x64") as told:
+        model.depth_at(tmp_path / "photo.png")
+    assert "\n" not in str(told.value)
+    assert DepthModel.from_pretrained(base, size="64x64").depth_at(tmp_path / "photo.png").shape == (30, 40)
 
 
 # ---- the packages themselves ----

@@ -183,14 +183,17 @@ def test_what_the_page_says(out, report):
         "validation 0 0 0 0 0 0 0 – –",
         "<script>alert(1)</script>",  # as text
         "the mask touches the border & more",
-        "masks proposed with score 0.83, not accepted: not used",
+        "masks proposed with a score of 0.83 (0 to 1), not accepted: not used",
         "flicker against <b>4 é.png",
-        "2.png warped moved 3.21 px",
+        "change outside 50 % · target area –",
+        "2.png moved into place camera motion 3.21 px",
         "3.png dropped blurred: sharpness 3 < 20",
         "<b>4 é.png registered to",
         "2.png features 250 240 0.96 0.40 3.21 3.30 4.5 – 0.080 9.50 1.25 accepts, corner 200000.0 px –",
-        "<b>4 é.png – – – – – – – – – – – – – 123",
-        "2.png not judged",
+        "<b>4 é.png – – – – – – – – – – – – – 123.40",
+        "2.png not checked",
+        "not checked : the group was rejected before this photo was looked at",
+        "mask agreement : overlap (intersection over union)",
         "bad rejected",
         "1.png: not a readable image",
         "no picture",
@@ -212,6 +215,34 @@ def test_the_papers_rule_is_shown_only_where_it_was_asked(out, report):
     words = " ".join(" ".join(Page(text).words).split())
     assert "rule alone" not in text and "accepts" not in text
     assert "2.png features 250 240 0.96 0.40 3.21 3.30 4.5 – 0.080 9.50 1.25 –" in words
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "mean", "text"),
+    [
+        (0.062, 1.0, 0.5312, "6.2 – 100 % (mean 53.1 %)"),
+        (0.0000004, 0.99996, 0.1, "0.00004 – 100 % (mean 10 %)"),
+        (0, 0, 0, "0 – 0 % (mean 0 %)"),
+    ],
+)
+def test_figures_have_no_exponents(out, report, low, high, mean, text):
+    report["statistics"]["train"]["mask_area"] = {"min": low, "max": high, "mean": mean}
+    report["statistics"]["train"]["group_size"] = {"min": 2, "max": 1234, "mean": 45678.9}
+    page = Page(write_html(out, report).read_text(encoding="utf-8"))
+    words = " ".join(" ".join(page.words).split())
+    assert text in words and "2 – 1234 (mean 45679)" in words and "e+0" not in words and "e-0" not in words
+
+
+def test_pictures_can_be_enlarged_as_far_as_the_file_allows(out, report, monkeypatch):
+    """The more pictures, the smaller; a small photo is never blown up beyond the thumbnail's width."""
+    save(out / "train/hall/images/3.png", picture(3).resize((1600, 1200)))
+    report["groups"][0]["frames"][2] |= {"status": "identity", "prepared": "train/hall/images/3.png"}
+    for pixels, width in ((60e6, 960), (1e3, 240)):
+        monkeypatch.setattr("gift_peft.prepare.page.PIXELS", pixels)
+        page = Page(write_html(out, report).read_text(encoding="utf-8"))
+        assert sorted({attrs["width"] for tag, attrs in page.tags if tag == "img"}) == sorted({"240", str(width)})
+    shots = [attrs for tag, attrs in page.tags if tag == "div" and attrs.get("class", "").startswith("shot")]
+    assert len([attrs for attrs in shots if "tabindex" in attrs]) == 8 == sum(tag == "img" for tag, _ in page.tags)
 
 
 def test_nothing_outside_the_file_and_no_scripts(out, report):

@@ -358,33 +358,3 @@ def test_command_line(made, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["prepare", str(raw), str(raw / "out")])
     assert ended.value.code == 1 and "gift-peft: error: OUT" in capsys.readouterr().err
-
-
-# ---- masks that are missing ----
-
-
-def test_proposed_masks_are_used_only_when_accepted(tmp_path):
-    group = capture(tmp_path / "raw/g", 14, count=3, size=SIZE)
-    drawn = np.asarray(Image.open(group / "masks/2.png")) > 0
-    shutil.rmtree(group / "masks")
-    raw, out = tmp_path / "raw", tmp_path / "out"
-    found = prepare_gift_i(raw, out)["groups"][0]
-    assert found["status"] == "rejected" and "missing mask" in found["reasons"][0]["text"]
-    found = prepare_gift_i(raw, out, PrepareSettings(propose_masks=True))["groups"][0]
-    assert found["status"] == "rejected" and found["reasons"][0]["code"] == "masks_proposed"
-    assert found["proposal"]["accepted"] is False and len(found["proposal"]["masks"]) == 3
-    assert not (out / "train/g").exists() and not (raw / "g/masks_proposed").exists()
-    mask = np.asarray(Image.open(out / found["proposal"]["masks"][2])) > 0
-    assert (mask & drawn).sum() / (mask | drawn).sum() > 0.6
-    settings = PrepareSettings(propose_masks=True, accept_proposed_masks=True)
-    found = prepare_gift_i(raw, out, settings)["groups"][0]
-    assert found["status"] == "kept" and found["proposal"]["accepted"] is True
-    assert "proposed" in (out / "README.md").read_text()
-    row = load_gift_i(out, "train")[0]
-    assert np.array_equal(np.asarray(row["masks"][2]) > 0, mask)
-    for name in found["proposal"]["masks"]:  # taken over by hand: now they are drawn
-        (group / "masks").mkdir(exist_ok=True)
-        shutil.copy(out / name, group / "masks")
-    found = prepare_gift_i(raw, out)["groups"][0]
-    assert found["status"] == "kept" and found["proposal"] is None
-    assert "proposed" not in (out / "README.md").read_text() and not (out / "masks_proposed/train/g").exists()

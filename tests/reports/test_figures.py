@@ -14,6 +14,8 @@ from gift_peft.reports.figures import (
     CAPTION,
     GAP,
     HEADER,
+    LEGEND,
+    TEXT,
     TILE_WIDTH,
     align_panel,
     before_after,
@@ -27,7 +29,7 @@ from gift_peft.reports.figures import (
 
 def tiles(picture: Image.Image, row=0, size=(60, 75)) -> list[np.ndarray]:
     height = round(TILE_WIDTH * size[0] / size[1])
-    top = HEADER + row * (CAPTION + height + GAP) + CAPTION
+    top = HEADER + row * (CAPTION + height + LEGEND + GAP) + CAPTION
     pixels = np.asarray(picture)
     return [
         pixels[top : top + height, left : left + TILE_WIDTH]
@@ -39,7 +41,7 @@ def tiles(picture: Image.Image, row=0, size=(60, 75)) -> list[np.ndarray]:
 def test_before_after_shows_one_range_and_unknown_in_the_reference_only(tmp_path, kind):
     path = before_after([panel(kind=kind), panel(1, kind=kind)], tmp_path / "figure.png")
     picture = Image.open(path)
-    assert picture.size == (GAP + 4 * (TILE_WIDTH + GAP), HEADER + 2 * (CAPTION + 410 + GAP))
+    assert picture.size == (GAP + 4 * (TILE_WIDTH + GAP), HEADER + 2 * (CAPTION + 410 + LEGEND + GAP))
     for row in range(2):
         rgb, reference, base, adapted = tiles(picture, row)
         grey = [(tile[7:57, 7:57] == GREY).all(-1).all() for tile in (rgb, reference, base, adapted)]
@@ -72,7 +74,8 @@ def test_before_after_says_where_the_target_has_no_reference(tmp_path, monkeypat
     blind = panel()
     blind.reference[blind.target] = 0
     before_after([panel(), blind], tmp_path / "figure.png")
-    assert "mm before, " in captions[0] and "RMSE in the outline: unknown" in captions[1]
+    rows = [text for text in captions if "RMSE" in text]
+    assert "mm before, " in rows[0] and "RMSE in the outline: unknown" in rows[1]
 
 
 @pytest.mark.parametrize("kind", ["depth", "inverse_depth"])
@@ -91,7 +94,7 @@ def test_error_maps_are_errors_after_alignment(kind):
     order = np.argsort(error)
     assert (np.diff(brightness[order]) >= -12).all() and brightness.max() > brightness.min() + 100
     expected = np.sqrt(np.mean((aligned.base - own.reference)[own.target] ** 2))
-    assert f"{expected:.0f} mm before, 0 mm after" in row.caption
+    assert f"{expected:,.0f} mm before, 0 mm after" in row.caption
 
 
 def test_pixels_that_do_not_count_neither_fit_nor_score():
@@ -131,11 +134,46 @@ def test_a_pdf_is_the_same_picture_seven_inches_wide_and_the_same_every_time(tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pdf", "a.png", "b.pdf"]
 
 
-def test_a_long_caption_is_not_cut(tmp_path):
-    long = panel(label="a/" + "very_long_name_of_a_picture" * 4 + ".png, largest error of the base")
-    pixels = np.asarray(Image.open(error_maps([long], tmp_path / "figure.png")).convert("L"))
-    caption = pixels[HEADER : HEADER + CAPTION]
-    assert (caption[:, -GAP:] == 255).all() and (caption[:, -40 * GAP :] < 128).any()
+def test_a_long_caption_goes_on_in_the_next_line_at_the_same_size(tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr(
+        ImageDraw.ImageDraw, "text", lambda self, at, text, font, **_: written.append((text, font.size, font))
+    )
+    name = "a/" + "very_long_name_of_a_picture" * 6 + ".png, largest error of the base"
+    picture = Image.open(error_maps([panel(label=name)], tmp_path / "figure.png"))
+    lines = [(text, size, font) for text, size, font in written if size == TEXT][:-2]  # without the bar's two
+    assert len(lines) > 1 and {size for _, size, _ in lines} == {TEXT}
+    assert "".join(text for text, *_ in lines).replace(" ", "").startswith(name.replace(" ", ""))
+    assert all(font.getlength(text) <= picture.width - 2 * GAP for text, _, font in lines)
+    assert picture.height == HEADER + len(lines) * CAPTION + 410 + LEGEND + GAP
+
+
+@pytest.mark.parametrize("size", [(40, 30), (30, 40), (64, 36), (50, 50)])
+def test_tiles_have_the_photos_own_aspect_ratio(tmp_path, size):
+    """Predictions have the network's; nobody wants to see a face squeezed to it."""
+    own = panel(image=Image.new("RGB", size, (200, 30, 30)))
+    picture = np.asarray(Image.open(before_after([own], tmp_path / "figure.png")))
+    height = round(TILE_WIDTH * size[1] / size[0])
+    assert picture.shape[0] == HEADER + CAPTION + height + LEGEND + GAP
+    photo = picture[HEADER + CAPTION : HEADER + CAPTION + height, GAP : GAP + TILE_WIDTH].astype(int)
+    red = (np.abs(photo - (200, 30, 30)).sum(-1) < 40).mean()
+    assert red > 0.9  # all but the outline
+
+
+@pytest.mark.parametrize("kind", ["depth", "inverse_depth"])
+def test_the_color_bar_goes_from_near_to_far_with_units(kind):
+    near, far = (4.0, 0.0000125) if kind == "inverse_depth" else (0.5, 12345.678)
+    row = prediction_row(
+        "photo.jpg", Image.new("RGB", (40, 30)), [np.full((30, 40), near), np.full((30, 40), far)], kind
+    )
+    assert row.bar.left.startswith("near: ") and row.bar.right.startswith("far: ")
+    assert "e" not in row.bar.left.split()[1] + row.bar.right.split()[1]
+    assert "(the model's units)" in row.bar.right
+    assert (row.bar.colors[0, 0] == row.tiles[1][0, 0]).all() and (row.bar.colors[0, -1] == row.tiles[2][0, 0]).all()
+    millimeters = panel_row(panel(kind=kind)).bar
+    first, last = (int(text.split()[1].replace(",", "")) for text in (millimeters.left, millimeters.right))
+    assert first < last and millimeters.left.endswith(" mm")
+    assert (error_row(panel()).bar.left, error_row(panel()).bar.right[-11:]) == ("no error", " mm or more")
 
 
 def test_other_suffixes_are_refused(tmp_path):

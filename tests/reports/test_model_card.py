@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import tomllib
 from dataclasses import asdict
 from pathlib import Path
@@ -51,6 +52,20 @@ def make(tmp_path, adapted, **changes):
     record = upload.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
     (tmp_path / "README.md").write_text(model_card.model_card(asdict(args), record))
     return ModelCard.load(tmp_path / "README.md")
+
+
+def test_a_card_without_a_countable_group_has_no_nan(tmp_path):
+    """GCE of groups without a pair is NaN: no metric of the card, whose data stay what JSON can hold."""
+    rows = random_rows([1, 1])
+    report = report_of(rows, gce=dict.fromkeys(("base", "adapted", "base_normalized", "adapted_normalized"), math.nan)
+                       | {"num_groups": 0, "num_skipped": 2})  # fmt: skip
+    args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out")
+    record = upload.run_record(args, **RECORD, metrics={"base": ROW | {"val_gce": None}, "adapter": ROW})
+    for reports in ([report], []):
+        for metrics in (record["metrics"], {"base": ROW, "adapter": ROW | {"val_gce": math.nan}}):
+            card = ModelCard(model_card.model_card(asdict(args), record | {"metrics": metrics}, reports))
+            json.dumps(card.data.to_dict(), allow_nan=False)
+            assert "nan" not in card.content.lower().split() and card.data.eval_results
 
 
 def test_metadata_on_the_hub(tmp_path):

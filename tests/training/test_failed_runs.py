@@ -111,7 +111,7 @@ def test_validation_groups_that_choose_nothing_are_told(base_dir, tree, tmp_path
     result = train(arguments(base_dir, tmp_path / "raw", tmp_path / "out", max_steps=1))
     assert (result.best_step, result.metrics[-1]["val_gce"]) == (None, None)
     assert result.metrics[-1]["val_tom_rmse"] is not None
-    assert "it is the last adapter, chosen by nothing" in capsys.readouterr().out
+    assert "simply the last one, not the best of several" in capsys.readouterr().out
 
 
 def test_a_diverging_run_names_the_group(base_dir, tree, tmp_path):
@@ -158,5 +158,5 @@ def test_a_disk_that_is_full_names_the_checkpoint(base_dir, tree, tmp_path, monk
 
 def test_a_tracker_that_is_not_installed(base_dir, tree, tmp_path, monkeypatch):
     monkeypatch.setattr(start, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="report_to: trackio is not installed"):
+    with pytest.raises(ValueError, match=r"report_to: trackio is not installed; pip install gift-peft\[trackio\]"):
         train(arguments(base_dir, tree, tmp_path / "out", report_to="trackio"))

@@ -7,6 +7,7 @@ with true depth, and the base was pre-trained on rooms without a mirror or glass
 
 import filecmp
 import os
+import shlex
 import shutil
 from collections.abc import Sequence
 from importlib.resources import as_file, files
@@ -71,7 +72,8 @@ def run_demo(
     for run, args in zip(runs.values(), arguments.values(), strict=True):
         if holds_run(run) and not overwrite_output_dir and not args.resume_from_checkpoint:
             raise ValueError(
-                f"out: {run} already holds a run; --overwrite_output_dir deletes it, --out names another folder"
+                f"out: {run} already holds a run; --resume_from_checkpoint latest goes on with it, "
+                "--overwrite_output_dir deletes it, --out names another folder"
             )
         check_folder(run, args)
         if not _holds_demo(run) and (there := [name for name in OUTPUTS if (run / name).exists()]):
@@ -84,7 +86,7 @@ def run_demo(
     for number, (name, args) in enumerate(arguments.items(), 1):
         if len(arguments) > 1:
             print(f"Training {number} of {len(arguments)}: {LABELS[name]}", flush=True)
-        if train(args).signal:
+        if train(args, resume_command=_resume_command(out, seed, target, extra)).signal:
             raise KeyboardInterrupt
 
     groups = parsed(load_gift_i(out / "gift-i", "validation"))
@@ -132,6 +134,15 @@ def _evaluate(model: DepthModel, groups, out: Path, run: Path, seed: int) -> dic
         report.save(run / f"evaluation-{reference}")
         reports[reference] = report
     return reports
+
+
+def _resume_command(out: Path, seed: int, target: str | None, extra: Sequence[str]) -> str:
+    """What goes on with a stopped demo up to its table and pictures; `gift-peft train` would end before them."""
+    words = ["gift-peft", "demo", "--out", str(out), "--seed", str(seed)]
+    words += ["--target", target, *extra] if target else extra
+    if not any(word.replace("_", "-").startswith("--resume-from-checkpoint") for word in extra):
+        words += ["--resume_from_checkpoint", "latest"]
+    return shlex.join(words)
 
 
 def _holds_demo(out: Path) -> bool:

@@ -309,7 +309,7 @@ def _score_group(sample: Sample, task: Task) -> tuple[dict, list[dict]]:
         error = GeometryConsistencyError()
         group[f"gce_{name}"] = error.update(*_on_one_grid(depths, masks, valids))
         group[f"gce_{name}_normalized"] = error.compute_normalized()
-        group["counted"] = error.num_groups == 1  # False: no two target masks meet
+        group["counted"] = error.num_groups == 1  # False: no two target masks overlap
     return group, rows
 
 

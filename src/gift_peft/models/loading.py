@@ -269,6 +269,15 @@ def _forward(network: Any, pixel_values: torch.Tensor) -> Any:
     try:
         with torch.no_grad(), torch.autocast(device.type, enabled=False):
             return network(pixel_values=pixel_values.to(device)) if is_module else network(pixel_values)
+    except RuntimeError as error:
+        # Some architectures take squares only, or more than the patch size asks for; they say it in terms of tensors.
+        if isinstance(error, torch.OutOfMemoryError) or not re.search(r"\bshapes?\b|\bsizes?\b", str(error)):
+            raise
+        own = getattr(getattr(network, "config", None), "image_size", None)
+        advice = f"its own is --size {own}x{own}" if isinstance(own, int) else "give a square --size"
+        sides = "x".join(map(str, pixel_values.shape[-2:]))
+        text = f"the model does not take images of {sides} (height x width): {reason(error)}; {advice}"
+        raise ValueError(text) from error
     finally:
         for module in training:
             module.training = True

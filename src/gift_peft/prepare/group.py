@@ -4,7 +4,9 @@
 registers it, and its entry in the report.
 """
 
+import math
 import os
+import shutil
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -16,11 +18,12 @@ from PIL import Image
 from gift_peft.captures.tree import Capture, Decoded, check_masks, decode_capture
 from gift_peft.dataset.writer import write_group
 from gift_peft.prepare.entries import FrameEntry, GroupEntry, GroupQuality, ReferenceQuality, Remark
-from gift_peft.prepare.job import Job, Outcome, capture_digest, printable
+from gift_peft.prepare.frame_bar import note_frame
+from gift_peft.prepare.job import Job, Outcome, capture_digest, group_choices, printable, proposal_choices
 from gift_peft.prepare.matching import Frame
 from gift_peft.prepare.quality import SmallFrame, check_frames, check_group_change, pairwise_changes
 from gift_peft.prepare.registration import Registration, register, valid_area, warp
-from gift_peft.prepare.settings import QualitySettings, RegistrationSettings
+from gift_peft.prepare.settings import QualitySettings
 from gift_peft.rules import check_count, check_group_id, check_pair
 
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything
@@ -100,24 +103,25 @@ def prepare_group(job: Job) -> Outcome:
     """Read, register, check and stage one group. What is wrong with it ends in its entry, never in an exception."""
     cv2.setNumThreads(1)  # groups run side by side instead
     entry = GroupEntry(printable(job.group_id), job.split, job.relative(job.folder))
-    digest = row = None
+    digest = row = proposed_from = None
     try:
         check_group_id(job.group_id)
         capture = job.read()
         list_frames(capture, job, entry)
-        digest = capture_digest(capture, asdict(job.settings))
+        digest = capture_digest(capture, group_choices(job.settings, capture))
+        proposed_from = capture_digest(capture, proposal_choices(job.settings))
         if digest != job.known:
-            row = _make(capture, job, entry)
+            row = _make(capture, job, entry, proposed_from)
     except Rejection as rejection:
         entry.reject(rejection.reason)
     except (OSError, ValueError, cv2.error, MemoryError, RecursionError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
         entry.reject(Remark("unreadable", printable(text.replace(f"{job.raw}{os.sep}", ""))))
         digest = None  # it may be a passing trouble (permissions, memory): try again next time
-    return Outcome(digest, entry.as_json(), row)
+    return Outcome(digest, entry.as_json(), row, proposed_from)
 
 
-def _make(capture: Capture, job: Job, entry: GroupEntry) -> dict:
+def _make(capture: Capture, job: Job, entry: GroupEntry, proposed_from: str) -> dict:
     """The staged group's metadata row."""
     if not job.settings.propose_masks:
         check_masks(capture)
@@ -127,8 +131,8 @@ def _make(capture: Capture, job: Job, entry: GroupEntry) -> dict:
     if decoded.common is not None:
         photos = carry_mask(photos, decoded.common, decoded.common_from, static, job)
     elif any(photo.mask is None for photo in photos):
-        propose_masks(photos, reference, static, job, entry)
-    register_photos(photos, reference, static, job.settings.registration)
+        propose_masks(photos, reference, static, job, entry, proposed_from)
+    register_photos(photos, reference, static, job)
     check(photos, reference, job, entry)
     return write([photo for photo in photos if not photo.dropped], reference, entry.surface, job)
 
@@ -168,15 +172,15 @@ def decode(capture: Capture, job: Job, entry: GroupEntry) -> tuple[list[Photo], 
     return photos, Photo(entry.frames[-1], capture.reference, np.asarray(decoded.reference), None), decoded
 
 
-def register_photos(
-    photos: list[Photo], reference: Photo | None, static: bool, settings: RegistrationSettings
-) -> None:
+def register_photos(photos: list[Photo], reference: Photo | None, static: bool, job: Job) -> None:
     """Every other observation, and the treated reference, to the last observation."""
+    settings = job.settings.registration
     *others, last = photos
     last.matrix = np.eye(3)
     target = Frame(last.pixels, last.mask, settings)
     for photo in others:
         photo.decide(register(Frame(photo.pixels, photo.mask, settings), target, static))
+        note_frame(job.notes)
     if reference is None:
         return
     # Nobody draws a mask for it, and the camera may have moved a little: the target's, and some more.
@@ -203,7 +207,7 @@ def carry_mask(photos: list[Photo], mask: np.ndarray, drawn_on: int | None, stat
     lacking = [photo for photo in photos if photo.mask is None]
     for photo in lacking:
         photo.mask = mask if photo is source else _around(mask)
-    register_photos(photos, None, static, job.settings.registration)
+    register_photos(photos, None, static, job)
     if source.dropped:
         text = "; ".join(item.text for item in source.entry.reasons)
         raise Rejection("mask_not_carried", f"{source.entry.name} alone has a mask, and cannot be registered: {text}")
@@ -214,42 +218,87 @@ def carry_mask(photos: list[Photo], mask: np.ndarray, drawn_on: int | None, stat
     return [photo for photo in photos if not photo.dropped]
 
 
-def propose_masks(photos: list[Photo], reference: Photo | None, static: bool, job: Job, entry: GroupEntry) -> None:
-    """Masks for a group that lacks some; they stay beside the dataset unless accepted."""
-    from gift_peft.prepare.proposals import propose, refine
+def propose_masks(
+    photos: list[Photo], reference: Photo | None, static: bool, job: Job, entry: GroupEntry, proposed_from: str
+) -> None:
+    """Masks for a group that lacks some; they stay beside the dataset unless accepted.
 
+    What an earlier run proposed from the same files and settings is taken as it is.
+    """
     drawn = [photo.mask for photo in photos]
-    for photo in photos:
-        photo.mask = None
-    register_photos(photos, reference, static, job.settings.registration)
-    usable = [photo for photo in photos if not photo.dropped]
-    if len(usable) < 2:
-        raise Rejection("no_proposal", "fewer than two frames are registered, so nothing can be compared")
-    aligned = [photo.registered(photo.pixels) for photo in usable]
-    proposal = propose(aligned)
-    if job.settings.refine is not None and proposal.mask.any():
-        proposal = refine(proposal, aligned[-1], job.settings.refine)
-    folder = job.staging / "masks_proposed" / job.split / job.group_id
-    paths = []
-    for photo in usable if proposal.mask.any() else ():
-        photo.mask = warp(proposal.mask, np.linalg.inv(photo.matrix))
-        path = (folder / photo.entry.name).with_suffix(".png")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(photo.mask.astype(np.uint8) * 255).save(path)
-        paths.append(path.relative_to(job.staging).as_posix())
-    accepted = job.settings.accept_proposed_masks and bool(paths)
-    more = {"mask_area": float(proposal.mask.mean()), "accepted": accepted, "masks": paths}
-    entry.proposal = {key: value for key, value in asdict(proposal).items() if key != "mask"} | more
-    if not paths:
-        raise Rejection("no_proposal", "nothing stands out from noise and changes of the light")
-    if not accepted:
+    if job.proposed is not None and job.proposed["from"] == proposed_from:
+        entry.proposal = _take_over(photos, job)
+    else:
+        entry.proposal = _propose(photos, reference, static, job)
+    score, least = entry.proposal["score"], job.settings.min_proposal_score
+    if not entry.proposal["masks"]:
+        raise Rejection("no_proposal", "nothing stands out from noise and changes of the light; draw the masks")
+    if not job.settings.accept_proposed_masks:
         text = "masks are missing; look at the proposed ones, then copy them into masks/ or accept them"
         raise Rejection("masks_proposed", f"{text} (--accept-proposed-masks)")
+    if score < least:
+        text = (
+            f"the proposed mask has a score of {score:.2f}, below {least:g}, and is not accepted: much of what "
+            "changes lies elsewhere, so this may be no target; look at it, then copy it into masks/, draw another, "
+            f"or accept it with --min-proposal-score {math.floor(100 * score) / 100:g}"
+        )
+        raise Rejection("weak_proposal", text)
+    entry.proposal["accepted"] = True
     for photo, mask in zip(photos, drawn, strict=True):
         if mask is not None:
             photo.mask = mask
-        elif photo.mask is None:  # dropped above, and it will be again
+        elif photo.mask is None:  # dropped by registration, and it will be again
             photo.mask = np.zeros(photo.pixels.shape[:2], bool)
+
+
+def _propose(photos: list[Photo], reference: Photo | None, static: bool, job: Job) -> dict:
+    """The entry's `proposal`, its masks in the staging folder and in `photos` (None where there is none)."""
+    from gift_peft.prepare.proposals import propose, refine
+
+    for photo in photos:
+        photo.mask = None
+    register_photos(photos, reference, static, job)
+    usable = [photo for photo in photos if not photo.dropped]
+    compared = [photo.registered(photo.pixels) for photo in usable]
+    if len(compared) < 2 and reference is not None and not reference.dropped:
+        # The treated surface looks different too, and what changes beside it is the same as ever.
+        compared.insert(0, reference.registered(reference.pixels))
+    if len(compared) < 2:
+        text = (
+            "a mask is proposed from what differs between two photos of one camera pose, and this group has one that "
+            "can be used; draw its mask, or add another photo or the treated reference"
+        )
+        raise Rejection("no_proposal", text)
+    proposal = propose(compared)
+    if job.settings.refine is not None and proposal.mask.any():
+        proposal = refine(proposal, compared[-1], job.settings.refine)
+    paths = []
+    for photo in usable if proposal.mask.any() else ():
+        photo.mask = warp(proposal.mask, np.linalg.inv(photo.matrix))
+        path = _proposed_path(job, photo)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(photo.mask.astype(np.uint8) * 255).save(path)
+        paths.append(path.relative_to(job.staging).as_posix())
+    more = {"mask_area": float(proposal.mask.mean()), "accepted": False, "masks": paths}
+    return {key: value for key, value in asdict(proposal).items() if key != "mask"} | more
+
+
+def _take_over(photos: list[Photo], job: Job) -> dict:
+    """The proposal of an earlier run, its masks copied to the staging folder and read into `photos`."""
+    proposal, out = job.proposed["proposal"], job.proposed["out"]
+    for photo in photos:
+        path = _proposed_path(job, photo)
+        photo.mask = None
+        if (name := path.relative_to(job.staging).as_posix()) in proposal["masks"]:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(out / name, path)
+            with Image.open(path) as mask:
+                photo.mask = np.asarray(mask) > 0
+    return proposal | {"accepted": False}
+
+
+def _proposed_path(job: Job, photo: Photo) -> Path:
+    return (job.staging / "masks_proposed" / job.split / job.group_id / photo.entry.name).with_suffix(".png")
 
 
 def check(photos: list[Photo], reference: Photo | None, job: Job, entry: GroupEntry) -> None:

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gift_peft.captures.tree import GROUP_FILES, Capture, read_capture
@@ -15,7 +15,7 @@ FORMAT = 1  # of records and report; a new one makes every group again
 @dataclass(frozen=True)
 class Job:
     """One group to prepare: `source` is its folder, or the capture itself; `known` the digest of what it was made from
-    in an earlier run."""
+    in an earlier run, `proposed` what that run proposed: `from`, a digest, the entry's `proposal`, and `out`."""
 
     raw: Path
     staging: Path
@@ -23,6 +23,12 @@ class Job:
     split: str
     settings: PrepareSettings
     known: str | None = None
+    proposed: dict | None = None
+
+    @property
+    def notes(self) -> Path:
+        """Where its finished frames are noted, for the bar."""
+        return self.staging / f"{self.split}.{self.group_id}.frames"
 
     @property
     def folder(self) -> Path:
@@ -50,12 +56,30 @@ class Job:
 
 @dataclass
 class Outcome:
-    """What became of a group: the digest of what it was made from, its entry in the report, and its metadata row if it
-    is kept (then it lies in the staging folder)."""
+    """What became of a group: the digest of what it was made from, its entry in the report, its metadata row if it
+    is kept (then it lies in the staging folder), and the digest of what its masks were proposed from."""
 
     digest: str | None
     entry: dict
     row: dict | None = None
+    proposed_from: str | None = None
+
+
+ABOUT_PROPOSALS = ("propose_masks", "accept_proposed_masks", "min_proposal_score", "refine")
+ABOUT_ACCEPTANCE = ABOUT_PROPOSALS[:3]
+
+
+def group_choices(settings: PrepareSettings, capture: Capture) -> dict:
+    """The settings that decide what becomes of this group: those about proposals only where a mask is missing."""
+    choices = asdict(settings)
+    if all(mask is not None for mask in capture.masks):
+        choices = {name: value for name, value in choices.items() if name not in ABOUT_PROPOSALS}
+    return choices
+
+
+def proposal_choices(settings: PrepareSettings) -> dict:
+    """The settings that decide what is proposed, whether or not it is accepted."""
+    return {name: value for name, value in asdict(settings).items() if name not in ABOUT_ACCEPTANCE}
 
 
 def capture_digest(capture: Capture, choices: dict) -> str:

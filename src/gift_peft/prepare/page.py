@@ -1,12 +1,14 @@
 """`report.html` of a prepared dataset: one file without scripts or links, made from `report.json` (`entries.py`).
 
-Statistics at the top, then a row per group: every frame with its mask's outline, what was done to it and why. The
+Statistics at the top, then a row per group: every frame with its mask's outline, what was done to it and why, and its
+figures with their meaning. A picture that is clicked is enlarged, as far as its share of the file's size allows. The
 flicker box of a group lets its frames alternate with the one they were registered to, which shows a camera that moved
 at once; a warped frame is shown before and after, with its differences from that frame.
 """
 
 import html
 import json
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,8 +19,11 @@ from tqdm import tqdm
 
 from gift_peft.files import write_whole
 from gift_peft.images import jpeg_uri, open_image
+from gift_peft.prepare.quality import plain_number
 
-WIDTH = 240  # of the thumbnails, in pixels
+WIDTH = 240  # of the thumbnails as they are shown, in pixels
+LARGEST = 960  # of a picture in the file, which is shown when it is clicked
+PIXELS = 60e6  # of all pictures in the file, about 12 MB; the more there are, the smaller they get
 AMPLIFY = 4  # of the differences
 
 STYLE = """
@@ -45,12 +50,56 @@ figure { flex: none; margin: 0 } figcaption { font-size: .82rem; max-width: max(
 .shot .outside { stroke: var(--bad); stroke-dasharray: 4 3 } .shot .proposed { stroke: #ff3df0; stroke-dasharray: 5 2 }
 .shot span { background: #000a; bottom: 0; color: #fff; font-size: .72rem; left: 0; padding: 0 .3rem }
 .shot span { position: absolute }
+.shot[tabindex] { cursor: zoom-in }
+.shot:focus { cursor: default; inset: 0; margin: auto; outline: 100vmax solid #000c;
+  position: fixed; width: min(94vw, 94vh * var(--ratio)); z-index: 1 }
 .missing { align-items: center; border: 1px dashed; box-sizing: border-box; display: flex; height: 135px;
   justify-content: center; width: 240px }
 details { margin: .4rem 0 } pre { white-space: pre-wrap; overflow-wrap: anywhere }
 .flicker:checked ~ .strip .blink img { animation: flicker 1s steps(1) infinite }
 @keyframes flicker { 50% { opacity: 0 } }
 """
+
+# What the words in the report mean. Statuses: the word, and its meaning.
+STATUSES = {
+    "identity": ("not moved", "the camera stood still, so the photo is kept as it is"),
+    "warped": ("moved into place", "the camera had moved; the photo is resampled to where it stood"),
+    "dropped": ("dropped", "not in the dataset, for the reason below it"),
+    "kept": ("registered to", "the photo that the others of its group are compared with and moved to"),
+    "rejected": ("not checked", "the group was rejected before this photo was looked at"),
+}
+# Figures of quality: the heading, its unit or number format, and its meaning.
+QUALITY = {
+    "clipped_dark": ("nearly black", "%", "share of the pixels"),
+    "clipped_bright": ("nearly white", "%", "share of the pixels"),
+    "outside_change": (
+        "change outside",
+        "%",
+        "share of the pixels outside the target whose surroundings look different",
+    ),
+    "outside_correlation": ("likeness outside", ".2f", "correlation outside the target; 1 is the same picture"),
+    "sharpness": ("sharpness", ".2f", "1 is the middle of the group"),
+    "target_change": (
+        "change inside",
+        ".1f",
+        "grey levels (0 to 255) inside the target, against the most similar photo",
+    ),
+    "mask_area": ("target area", "%", "share of the image that is target"),
+    "mask_border": ("target at the border", "%", "share of the image's border that is target"),
+    "mask_iou": (
+        "mask agreement",
+        "%",
+        "overlap (intersection over union) with the mask that most photos of the group have",
+    ),
+}
+MEANINGS = {
+    "inliers": "matches that one motion of the camera explains",
+    "spread": "how far these lie apart, over the image's diagonal",
+    "motion, moves": "in pixels of the photos",
+    "expected error": "of the registration, at the target's corners",
+    "difference": "mean grey difference (0 to 255) outside the target, before and after registration",
+    **{heading: meaning for heading, _, meaning in QUALITY.values()},
+}
 
 FIGURES = {  # of a frame's registration: heading and number format
     "method": ("method", "s"),
@@ -82,8 +131,10 @@ def write_html(out: Path, report: dict) -> Path:
     out = Path(out)
     groups = report["groups"]
     frames = sum(len(group["frames"]) for group in groups)
+    shots = sum(4 if frame["status"] == "warped" else 1 for group in groups for frame in group["frames"])
+    width = round(min(LARGEST, max(WIDTH, math.sqrt(PIXELS / 0.75 / max(1, shots)))))
     with tqdm(total=frames, unit="frame", desc="report.html", disable=None, leave=False) as bar:
-        sections = [_group(index, group, out, out / report["raw"], bar) for index, group in enumerate(groups)]
+        sections = [_group(index, group, out, out / report["raw"], width, bar) for index, group in enumerate(groups)]
     title = f"{len(groups)} groups, {frames} frames"
     page = [
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>Captures: ' + title + "</title>",
@@ -93,7 +144,9 @@ def write_html(out: Path, report: dict) -> Path:
         _index(groups),
         '<p class="facts">Outlines: <span style="color:var(--mask)">target mask</span>, '
         '<span style="color:#d33bc8">proposed mask</span>, '
-        '<span style="color:var(--bad)">border of what a warped frame shows</span>.</p>',
+        '<span style="color:var(--bad)">border of what a photo shows that was moved into place</span>. '
+        "Click a picture to enlarge it, and beside it to go back.</p>",
+        f'<p class="facts">{" · ".join(f"<b>{word}</b>: {meaning}" for word, meaning in STATUSES.values())}</p>',
         *sections,
         "<details><summary>Settings and versions</summary><pre>",
         _text(json.dumps({key: report.get(key) for key in ("settings", "versions")}, indent=1, ensure_ascii=False)),
@@ -113,7 +166,7 @@ def _statistics(statistics: dict) -> str:
     for split, found in statistics.items():
         cells = [split, *(_number(found.get(key), "d") for key in counts)]
         cells.append(_range(found.get("group_size"), 1, ".3g"))
-        rows.append([*cells, _range(found.get("mask_area"), 100, ".2g", " %")])
+        rows.append([*cells, _range(found.get("mask_area"), 100, ".3g", " %")])
     return _table(head, rows)
 
 
@@ -142,18 +195,18 @@ def _mood(group: dict) -> str:
 # ---- one group ----
 
 
-def _group(index: int, group: dict, out: Path, raw: Path, bar: tqdm) -> str:
+def _group(index: int, group: dict, out: Path, raw: Path, width: int, bar: tqdm) -> str:
     frames = group["frames"]
     target = next((frame for frame in frames if frame["name"] == group["target_frame"]), None)
-    target_image = None if target is None else _picture(target, out, raw)
+    target_image = None if target is None else _picture(target, out, raw, width)
     style = f' style="--target:url({jpeg_uri(target_image, quality=75)})"' if target_image is not None else ""
     proposal = group.get("proposal")
     size = group.get("size")
     facts = [group["split"], group.get("surface"), f"{size[0]}×{size[1]}" if size else None, group.get("notes")]
-    facts += [f"{key.replace('_', ' ')} {_number(value)}" for key, value in (group.get("quality") or {}).items()]
+    facts += [f"{QUALITY[key][0]} {_measured(key, value)}" for key, value in (group.get("quality") or {}).items()]
     if proposal:
         facts.append(
-            f"masks proposed with score {_number(proposal.get('score'))}, "
+            f"masks proposed with a score of {_number(proposal.get('score'), '.2f')} (0 to 1), "
             + ("accepted" if proposal.get("accepted") else "not accepted: not used")
         )
     parts = [
@@ -169,13 +222,13 @@ def _group(index: int, group: dict, out: Path, raw: Path, bar: tqdm) -> str:
         '<div class="strip">',
     ]
     for frame in frames:
-        parts.append(_frame(frame, group, target_image, out, raw))
+        parts.append(_frame(frame, group, target_image, out, raw, width))
         bar.update()
     return "\n".join([*parts, "</div>", _figures(frames), "</section>"])
 
 
-def _frame(frame: dict, group: dict, target: Image.Image | None, out: Path, raw: Path) -> str:
-    image = _picture(frame, out, raw)
+def _frame(frame: dict, group: dict, target: Image.Image | None, out: Path, raw: Path, width: int) -> str:
+    image = _picture(frame, out, raw, width)
     is_target = frame["name"] == group["target_frame"]
     blink = "" if is_target or target is None else " blink"
     outlines = [
@@ -185,7 +238,7 @@ def _frame(frame: dict, group: dict, target: Image.Image | None, out: Path, raw:
     ]
     wide = frame["status"] == "warped" and image is not None and target is not None
     if wide:
-        before = _thumbnail(raw / frame["original"])
+        before = _thumbnail(raw / frame["original"], width)
         shots = [_shot(before, "before", blink), _shot(image, "after", blink, outlines)]
         shots += [
             _shot(_difference(shown, target), f"{AMPLIFY} × difference {label}")
@@ -193,14 +246,16 @@ def _frame(frame: dict, group: dict, target: Image.Image | None, out: Path, raw:
         ]
     else:
         shots = [_shot(image, frame["role"] if frame["role"] != "observation" else "", blink, outlines)]
-    status, mood = frame["status"], frame["status"]
-    if status == "kept":  # the frame that the others are registered to, or the group was rejected before
-        status, mood = ("registered to", "kept") if group["status"] == "kept" else ("not judged", "")
+    status = mood = frame["status"]
+    if status == "kept" and group["status"] != "kept":  # else it is the frame that the others are registered to
+        status, mood = "rejected", ""
+    word, meaning = STATUSES[status]
     moved = (frame.get("registration") or {}).get("median_displacement")
+    tag = f'<span class="tag {mood}" title="{_text(meaning)}">{_text(word)}</span>'
     return (
         f'<figure class="{"wide" if wide else "narrow"}"><div class="shots">{"".join(shots)}</div>'
-        f'<figcaption><b>{_text(frame["name"])}</b> <span class="tag {mood}">{_text(status)}</span>'
-        + (f" moved {_number(moved, '.2f')} px" if moved is not None else "")
+        f"<figcaption><b>{_text(frame['name'])}</b> {tag}"
+        + (f" camera motion {_number(moved, '.2f')} px" if moved is not None else "")
         + _remarks(frame["reasons"], "dropped")
         + _remarks(frame["warnings"], "warning")
         + "</figcaption></figure>"
@@ -218,10 +273,11 @@ def _figures(frames: list[dict]) -> str:
         found, quality = frame.get("registration") or {}, frame.get("quality") or {}
         cells = [_number(found.get(key), form) for key, (_, form) in FIGURES.items()]
         cells += [_verdict(found.get("paper_exact"))] if exact else []
-        rows.append([frame["name"], *cells, *(_number(quality.get(key)) for key in measured)])
+        rows.append([frame["name"], *cells, *(_measured(key, quality.get(key)) for key in measured)])
     head = ["frame", *(heading for heading, _ in FIGURES.values()), *(["the paper's rule alone"] if exact else [])]
-    head += [key.replace("_", " ") for key in measured]
-    return f"<details><summary>Figures</summary>{_table(head, rows)}</details>"
+    head += [QUALITY[key][0] for key in measured]
+    meanings = " · ".join(f"<b>{_text(word)}</b>: {_text(meaning)}" for word, meaning in MEANINGS.items())
+    return f'<details><summary>Figures</summary>{_table(head, rows)}<p class="facts">{meanings}</p></details>'
 
 
 def _verdict(paper: dict | None) -> str:
@@ -235,18 +291,19 @@ def _verdict(paper: dict | None) -> str:
 # ---- pictures ----
 
 
-def _thumbnail(path: Path) -> Image.Image | None:
-    """RGB, WIDTH wide; None if the file cannot be read."""
+def _thumbnail(path: Path, width: int) -> Image.Image | None:
+    """RGB, `width` wide or as wide as the photo, at least WIDTH; None if the file cannot be read."""
     try:
         image = open_image(path)
-        size = WIDTH, max(1, round(WIDTH * image.height / image.width))
+        width = max(WIDTH, min(width, image.width))
+        size = width, max(1, round(width * image.height / image.width))
         return image.convert("RGB").resize(size, Image.Resampling.BOX, reducing_gap=2)
     except (OSError, ValueError):
         return None
 
 
-def _picture(frame: dict, out: Path, raw: Path) -> Image.Image | None:
-    return _thumbnail(out / frame["prepared"] if frame.get("prepared") else raw / frame["original"])
+def _picture(frame: dict, out: Path, raw: Path, width: int) -> Image.Image | None:
+    return _thumbnail(out / frame["prepared"] if frame.get("prepared") else raw / frame["original"], width)
 
 
 def _difference(image: Image.Image | None, target: Image.Image) -> Image.Image | None:
@@ -264,7 +321,8 @@ def _shot(image: Image.Image | None, label: str, blink: str = "", outlines: Iter
     caption = f"<span>{_text(label)}</span>" if label else ""
     size = f'width="{image.width}" height="{image.height}"'
     picture = f'<img src="{jpeg_uri(image, quality=75)}" {size} alt="{_text(label)}">'
-    return f'<div class="shot{blink}">{picture}{overlay}{caption}</div>'
+    ratio = f"--ratio:{image.width / image.height:.4g}"
+    return f'<div class="shot{blink}" tabindex="0" style="{ratio}">{picture}{overlay}{caption}</div>'
 
 
 def _proposed(frame: dict, group: dict) -> str | None:
@@ -312,11 +370,20 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def _number(value, form: str = ".3g") -> str:
+    """A figure in this form, but never with an exponent."""
     if value is None:
         return "–"
     if not isinstance(value, int | float) or form == "s":
         return str(value)
-    return format(round(value) if form == "d" else value, form)
+    return plain_number(value) if form == ".3g" else format(round(value) if form == "d" else value, form)
+
+
+def _measured(key: str, value: float | None) -> str:
+    """A figure of quality in its unit."""
+    unit = QUALITY[key][1]
+    if value is None or unit.startswith("."):
+        return _number(value, unit)
+    return f"{_number(100 * value)} %" if unit == "%" else f"{_number(value, '.1f')} {unit}"
 
 
 def _text(value) -> str:

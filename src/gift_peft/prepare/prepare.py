@@ -22,6 +22,7 @@ from gift_peft.dataset.writer import write_card, write_rows
 from gift_peft.files import remove_files, strangers, write_whole
 from gift_peft.options import package_version
 from gift_peft.prepare.entries import Statistics
+from gift_peft.prepare.frame_bar import FrameBar
 from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import FORMAT, Job, Outcome
 from gift_peft.prepare.out_folder import alone, check_card, check_places, note_card, side_by_side
@@ -64,11 +65,8 @@ def prepare_gift_i(
     settings = settings or PrepareSettings()
     if num_proc < 1:
         raise ValueError(f"num_proc: at least 1, got {num_proc}")
-    check_places("prepare", raw, "RAW", out, STATE)
-    groups = settings.layout.find(raw) if settings.layout is not None else find_groups(raw)
+    jobs = list_jobs(raw, out, settings)
     staging = out / STATE / "staging"
-    jobs = [Job(raw, staging, source, split, settings) for split in SPLITS for source in groups.get(split, [])]
-    _check_names(jobs)
     with alone("prepare", out, STATE):
         check_card("prepare", out, STATE)
         shutil.rmtree(staging, ignore_errors=True)
@@ -86,6 +84,19 @@ def prepare_gift_i(
     return report
 
 
+def list_jobs(raw: Path, out: Path, settings: PrepareSettings) -> list[Job]:
+    """Every group of RAW, with what an earlier run knows of it; nothing is written.
+
+    Raises ValueError or FileNotFoundError: `raw` or `out` is not what it should be, or two groups have one name.
+    """
+    check_places("prepare", raw, "RAW", out, STATE)
+    groups = settings.layout.find(raw) if settings.layout is not None else find_groups(raw)
+    staging = out / STATE / "staging"
+    jobs = [Job(raw, staging, source, split, settings) for split in SPLITS for source in groups.get(split, [])]
+    _check_names(jobs)
+    return [_with_record(job, _read_record(out, job), out) for job in jobs]
+
+
 def _make_groups(
     raw: Path, out: Path, settings: PrepareSettings, jobs: list[Job], num_proc: int
 ) -> tuple[dict, dict[str, dict[str, dict]]]:
@@ -94,8 +105,7 @@ def _make_groups(
     removed = _remove_others(out, records.keys())
     kept = {key: record["row"] for key, record in records.items() if record and record["row"]}
     write_rows(_rows(kept, jobs), out)
-    jobs = [replace(job, known=(records[job.split, job.group_id] or {}).get("digest")) for job in jobs]
-    with tqdm(total=len(jobs), desc="groups", unit="group", disable=None) as bar:
+    with FrameBar(_count_frames(jobs), "prepare") as bar:
         for job, outcome in side_by_side("prepare", prepare_group, jobs, num_proc):
             if outcome.digest is None or outcome.digest != job.known:
                 key = job.split, job.group_id
@@ -107,9 +117,30 @@ def _make_groups(
                     kept[key] = outcome.row
                     write_rows(_rows(kept, jobs), out)
                 records[key] = _write_record(out, job, outcome, files)
-            bar.update()
+            bar.group_done(job.notes)
     entries = [records[job.split, job.group_id]["entry"] for job in jobs]
     return _report(raw, out, settings, entries, removed), _rows(kept, jobs)
+
+
+def _with_record(job: Job, record: dict | None, out: Path) -> Job:
+    """The job with what an earlier run knows of its group."""
+    if record is None:
+        return job
+    proposal, source = record["entry"].get("proposal"), record.get("proposed_from")
+    proposed = {"from": source, "proposal": proposal, "out": out} if proposal and source else None
+    return replace(job, known=record["digest"], proposed=proposed)
+
+
+def _count_frames(jobs: list[Job]) -> dict[Path, int]:
+    """{file of a group's notes: its number of frames}; a group that cannot be read is one frame's work."""
+    counts = {}
+    for job in tqdm(jobs, desc="looking through RAW", unit="group", disable=None, leave=False, delay=0.5):
+        try:
+            capture = job.read()
+            counts[job.notes] = len(capture.images) + (capture.reference is not None)
+        except (OSError, ValueError, RecursionError):  # its own job says what is wrong
+            counts[job.notes] = 1
+    return counts
 
 
 def _check_names(jobs: list[Job]) -> None:

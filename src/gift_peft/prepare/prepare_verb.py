@@ -4,7 +4,6 @@ A YAML file (`--config`) may state the same names; the command line wins.
 """
 
 import argparse
-import difflib
 import sys
 from collections.abc import Sequence
 from dataclasses import Field, fields
@@ -12,7 +11,7 @@ from pathlib import Path
 
 from gift_peft.captures.foreign import read_layout
 from gift_peft.files import read_yaml
-from gift_peft.options import OptionParser, number
+from gift_peft.options import OptionParser, did_you_mean, number
 from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
 
 PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
@@ -28,7 +27,12 @@ def run(argv: Sequence[str]) -> int:
 
     Raises ValueError or an OSError (one line) where nothing could be made; a wrong command line leaves by SystemExit.
     """
-    args = parse_arguments(argv)
+    words = [word for word in argv if word.replace("_", "-") != "--dry-run"]
+    args = parse_arguments(words)
+    if len(words) < len(argv):
+        from gift_peft.prepare.prepare_plan import tell_plan
+
+        return tell_plan(Path(args.raw), Path(args.out), args.settings, args.num_proc)
     from gift_peft.prepare.prepare import prepare_gift_i
 
     report = prepare_gift_i(**vars(args))
@@ -40,6 +44,10 @@ def run(argv: Sequence[str]) -> int:
         for note in entry["warnings"]:
             if note["code"] in NOTES:
                 print(f"gift-peft: {entry['split']}/{entry['group_id']}: {note['text']}", file=sys.stderr)
+    accepted = [entry for entry in report["groups"] if entry["status"] == "kept" and entry["proposal"]]
+    if accepted:
+        names = ", ".join(f"{e['split']}/{e['group_id']} (score {e['proposal']['score']:.2f})" for e in accepted)
+        print(f"Masks that were proposed, not drawn, and accepted: {names}")
     for split, found in report["statistics"].items():
         print(
             f"{split}: {found['groups']} groups, {found['images']} images ({found['warped_frames']} frames warped, "
@@ -64,7 +72,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     values = vars(parser.parse_args(argv))
     if values["config"] is not None:
         values = vars(parser.parse_args([*_read_config(Path(values["config"])), *argv]))
-    del values["config"]
+    del values["config"], values["dry_run"]  # `run` has looked for the second
     parts = {name: kind(**{key: values.pop(key) for key in _options(kind)}) for name, kind in PARTS.items()}
     choices = {key: values.pop(key) for key in _options(PrepareSettings)}
     choices["propose_masks"] |= choices["accept_proposed_masks"] or choices["refine"] is not None
@@ -78,6 +86,8 @@ def make_parser() -> OptionParser:
     parser.add_argument("raw", metavar="RAW", help="folder of group folders; it is only read")
     parser.add_argument("out", metavar="OUT", help="prepared folder: new, or made by this command before")
     parser.add_argument("--config", metavar="FILE", help="YAML file with values for the options below")
+    text = "say what would be done and how long it takes, and write nothing; the exit code is that of the run"
+    parser.add_argument("--dry-run", action="store_true", help=text)
     parser.add_argument("--num-proc", type=number(int, 1), default=1, metavar="N", help="groups prepared side by side")
     parser.add_argument("--license", default="unknown", metavar="ID", help="for the dataset card, as cc-by-4.0")
     parser.add_argument("--pretty-name", metavar="NAME", help="for the dataset card; default: the name of RAW")
@@ -109,13 +119,12 @@ def _read_config(path: Path) -> list[str]:
     parser = make_parser()
     parser.error = refuse
     known = vars(parser.parse_args(["RAW", "OUT"]))
-    for key in ("raw", "out", "config"):
+    for key in ("raw", "out", "config", "dry_run"):
         del known[key]
     words = []
     for key, value in read_yaml(path, f"config {path}").items():
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            refuse(f"unknown key {key!r}" + (f"; did you mean {near[0]}?" if near else ""))
+            refuse(f"unknown key {key!r}{did_you_mean(str(key), known)}")
         flag = isinstance(known[key], bool)
         if isinstance(value, list | dict) or flag != isinstance(value, bool):
             refuse(f"{key}: {value!r}; expected {'true or false' if flag else 'one value'}")

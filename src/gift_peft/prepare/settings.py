@@ -94,6 +94,7 @@ class PrepareSettings:
         metadata=_option("what photos without a target are in a group whose others have one: an error, or fine")
         | {"choices": EMPTY_MASKS},
     )
+    min_proposal_score: float = _arg("score (0 to 1) below which a proposed mask is never accepted", 0.5)
     refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
     layout: Layout | None = field(
         default=None, metadata=_option("YAML file that says where RGB and mask files lie", metavar="FILE")

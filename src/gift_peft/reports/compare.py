@@ -9,7 +9,7 @@ from PIL import Image
 
 from gift_peft.files import write_whole
 from gift_peft.images import jpeg_uri
-from gift_peft.reports.figures import GridRow, Panel, outline, panel_row
+from gift_peft.reports.figures import ColorBar, GridRow, Panel, outline, panel_row
 
 TEMPLATE = Path(__file__).parent / "templates" / "compare.html"
 MIN_SIDE = 320  # smaller tiles are enlarged, so that the outline is a line and not a row of blocks
@@ -30,7 +30,7 @@ def write_compare(
     Raises:
         ValueError: no panels, or one whose arrays differ in size.
     """
-    articles = [(row.caption, _pictures(row)) for row in map(panel_row, panels)]
+    articles = [(row.caption, _pictures(row), _legend(row.bar)) for row in map(panel_row, panels)]
     if not articles:
         raise ValueError("compare.html needs at least one panel")
     template = jinja2.Template(TEMPLATE.read_text(encoding="utf-8"), autoescape=True, keep_trailing_newline=True)
@@ -40,11 +40,19 @@ def write_compare(
 
 def _pictures(row: GridRow) -> list[str]:
     """The row's tiles as data URIs, outlined."""
-    height, width = row.tiles[-1].shape[:2]
-    factor = max(1, -(-MIN_SIDE // width))
+    width = row.tiles[-1].shape[1]
+    width *= max(1, -(-MIN_SIDE // width))
+    photo = row.tiles[0]
+    height = round(width * photo.shape[0] / photo.shape[1])
     sources = []
     for tile in row.tiles:
-        image = Image.fromarray(tile).resize((factor * width, factor * height), Image.Resampling.BICUBIC)
+        image = Image.fromarray(tile).resize((width, height), Image.Resampling.BICUBIC)
         outlined = Image.fromarray(outline(np.asarray(image), row.target))
         sources.append(jpeg_uri(outlined, quality=92, subsampling=0))
     return sources
+
+
+def _legend(bar: ColorBar) -> dict[str, str]:
+    """The color bar's two texts, and its colors as stops of a CSS gradient."""
+    stops = ", ".join("#{:02x}{:02x}{:02x}".format(*bar.colors[0, index]) for index in range(0, 256, 17))
+    return {"left": bar.left, "right": bar.right, "stops": stops}

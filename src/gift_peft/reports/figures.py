@@ -6,6 +6,7 @@ the target outlined, unknown pixels grey in the reference and nowhere else. Pill
 
 import html
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,10 @@ from gift_peft.evaluation.protocols import get_protocol
 from gift_peft.files import write_whole
 from gift_peft.images import jpeg_uri
 
-TILE_WIDTH, GAP, HEADER, CAPTION = 512, 12, 54, 48  # pixels; text of 9 and 7 points in print
+TILE_WIDTH, GAP, HEADER, CAPTION, LEGEND = 512, 12, 54, 48, 46  # pixels
+TITLE, TEXT = 37, 29  # sizes of type in pixels: 9 and 7 points in print
+BAR_WIDTH, BAR_HEIGHT = 420, 22  # of the color bar
+MILLIMETERS, NATIVE = "mm", "(the model's units)"
 # How Pillow saves it. No dates in a PDF: the same panels give the same bytes.
 FORMATS = {
     ".png": {"optimize": True, "dpi": (300, 300)},
@@ -61,7 +65,7 @@ class Aligned:
 
     Args:
         errors (`tuple[float, float]`): RMSE inside the target, base and adapted; NaN where nothing is known there.
-        unit (`str`): ` mm`, or nothing for native units.
+        unit (`str`): MILLIMETERS or NATIVE.
         kind (`str`): of all three maps, for the colours.
     """
 
@@ -75,11 +79,24 @@ class Aligned:
 
 @dataclass
 class GridRow:
-    """One line of a figure: (H,W,3) uint8 tiles of one shape under a caption; `target` (h,w) bool is outlined."""
+    """One line of a figure: (H,W,3) uint8 tiles under a caption, and the colors' meaning below them.
+
+    The first tile is the photo, whose aspect ratio all are shown in; `target` (h,w) bool is outlined.
+    """
 
     caption: str
     tiles: list[np.ndarray]
+    bar: "ColorBar"
     target: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class ColorBar:
+    """The colors of a row from `left` to `right`, which are texts: (1,256,3) uint8."""
+
+    colors: np.ndarray
+    left: str
+    right: str
 
 
 def align_panel(panel: Panel) -> Aligned:
@@ -92,7 +109,8 @@ def align_panel(panel: Panel) -> Aligned:
     reference = np.where(valid & known(panel.reference), panel.reference, np.nan)
     errors = tuple(depth_metrics(d, panel.reference, panel.target & valid)["rmse"] for d in (base, adapted))
     native = get_protocol(panel.protocol).space == "native"
-    return Aligned(reference, base, adapted, errors, "" if native else " mm", panel.kind if native else "depth")
+    unit, kind = (NATIVE, panel.kind) if native else (MILLIMETERS, "depth")
+    return Aligned(reference, base, adapted, errors, unit, kind)
 
 
 def before_after(
@@ -100,8 +118,8 @@ def before_after(
 ) -> Path:
     """Draws one row per panel: picture, reference, base, adapted, aligned and in one colour range; near is bright.
 
-    The caption gives the RMSE inside the target before and after, and the range of the colours; `path` ends in .png or
-    .pdf.
+    The caption gives the RMSE inside the target before and after, the bar the range of the colors; `path` ends in .png
+    or .pdf.
 
     Raises:
         ValueError: no rows, or a panel whose arrays differ in size.
@@ -119,10 +137,8 @@ def panel_row(panel: Panel, *others: Panel) -> GridRow:
     low, high = color_range(*maps)
     tiles = [colorize(depth, low, high, aligned.kind) for depth in maps]
     errors = (*aligned.errors, *(other.errors[1] for other in more))
-    before, *after, near, far = _in_units((*errors, low, high), aligned.unit)
-    scores = "unknown" if np.isnan(errors).any() else f"{before} before, {' and '.join(after)} after"
-    caption = f"{panel.label}   RMSE in the outline: {scores}   (colours {near} to {far})"
-    return GridRow(caption, [_picture(panel), *tiles], panel.target)
+    bar = _bar(low, high, aligned.kind, aligned.unit)
+    return GridRow(_caption(panel.label, errors, aligned.unit), [_picture(panel), *tiles], bar, panel.target)
 
 
 def error_maps(
@@ -141,26 +157,50 @@ def error_row(panel: Panel) -> GridRow:
     aligned = align_panel(panel)
     errors = [np.abs(depth - aligned.reference) for depth in (aligned.base, aligned.adapted)]
     high = color_range(*errors)[1]
-    before, after, end = _in_units((*aligned.errors, high), aligned.unit)
-    scores = "unknown" if np.isnan(aligned.errors).any() else f"{before} before, {after} after"
-    caption = f"{panel.label}   RMSE in the outline: {scores}   (colours 0 to {end})"
-    return GridRow(caption, [_picture(panel), *(colorize_error(error, high) for error in errors)], panel.target)
+    tiles = [_picture(panel), *(colorize_error(error, high) for error in errors)]
+    colors = colorize_error(np.linspace(0, high, 256)[None], high)
+    bar = ColorBar(colors, "no error", f"{_in_units(high, aligned.unit)} or more{_unit(aligned.unit)}")
+    return GridRow(_caption(panel.label, aligned.errors, aligned.unit), tiles, bar, panel.target)
 
 
 def prediction_row(label: str, image: Image.Image, predictions: Sequence[np.ndarray], kind: str) -> GridRow:
     """A photograph and predictions (H,W) of it in native units, in one range, without any reference."""
     low, high = color_range(*predictions)
     tiles = [colorize(depth, low, high, kind) for depth in predictions]
-    caption = f"{label}   (colours {low:.3g} to {high:.3g})"
-    return GridRow(caption, [np.asarray(image.convert("RGB")), *tiles])
+    return GridRow(label, [np.asarray(image.convert("RGB")), *tiles], _bar(low, high, kind, NATIVE))
 
 
 def _picture(panel: Panel) -> np.ndarray:
     return np.asarray(panel.image.convert("RGB"))
 
 
-def _in_units(values: Sequence[float], unit: str) -> list[str]:
-    return [f"{value:.0f}{unit}" if unit else f"{value:.3g}" for value in values]
+def _caption(label: str, errors: Sequence[float], unit: str) -> str:
+    """What the row shows, and the error of the base and of each adapted prediction."""
+    scores = "unknown"
+    if not np.isnan(errors).any():
+        before, *after = (_in_units(error, unit) for error in errors)
+        scores = f"{before} before, {' and '.join(after)} after{_unit(unit)}"
+    return f"{label} · RMSE in the outline: {scores}"
+
+
+def _bar(low: float, high: float, kind: str, unit: str) -> ColorBar:
+    """From near to far, whatever is larger in this kind of prediction."""
+    near, far = (high, low) if kind == "inverse_depth" else (low, high)
+    colors = colorize(np.linspace(near, far, 256)[None], low, high, kind)
+    return ColorBar(colors, f"near: {_in_units(near, unit)}", f"far: {_in_units(far, unit)}{_unit(unit)}")
+
+
+def _in_units(value: float, unit: str) -> str:
+    """Whole millimeters; three digits of the model's own units, never with an exponent."""
+    if unit == MILLIMETERS:
+        return f"{value:,.0f} mm"
+    digits = 0 if value == 0 else math.floor(math.log10(abs(value)))
+    return f"{value:,.{min(max(2 - digits, 0), 6)}f}"
+
+
+def _unit(unit: str) -> str:
+    """What follows the last of several numbers: millimeters stand behind each, the model's units once."""
+    return "" if unit == MILLIMETERS else f" {unit}"
 
 
 # ---- drawing ----
@@ -184,7 +224,7 @@ def _draw(rows: Sequence[GridRow], columns: Sequence[str]) -> Image.Image:
     canvas = Image.new("RGB", (strips[0].width, HEADER + sum(strip.height for strip in strips)), "white")
     for index, title in enumerate(columns):
         center = GAP + index * (TILE_WIDTH + GAP) + TILE_WIDTH // 2
-        _write(canvas, (center, HEADER // 2), title, 37, TILE_WIDTH, "mm")
+        _write(canvas, (center, HEADER // 2), title, TITLE, "mm")
     top = HEADER
     for strip in strips:
         canvas.paste(strip, (0, top))
@@ -193,24 +233,43 @@ def _draw(rows: Sequence[GridRow], columns: Sequence[str]) -> Image.Image:
 
 
 def _draw_strip(row: GridRow) -> Image.Image:
-    height, width = row.tiles[-1].shape[:2]
+    height, width = row.tiles[0].shape[:2]
     height = round(TILE_WIDTH * height / width)
-    strip = Image.new("RGB", (GAP + len(row.tiles) * (TILE_WIDTH + GAP), CAPTION + height + GAP), "white")
-    _write(strip, (GAP, CAPTION // 2), row.caption, 29, strip.width - 2 * GAP, "lm")
+    total = GAP + len(row.tiles) * (TILE_WIDTH + GAP)
+    lines = _wrapped(row.caption, TEXT, total - 2 * GAP)
+    top = len(lines) * CAPTION
+    strip = Image.new("RGB", (total, top + height + LEGEND + GAP), "white")
+    for number, line in enumerate(lines):
+        _write(strip, (GAP, number * CAPTION + CAPTION // 2), line, TEXT, "lm")
     for index, tile in enumerate(row.tiles):
         resized = Image.fromarray(tile).resize((TILE_WIDTH, height), Image.Resampling.BICUBIC)
         shown = np.asarray(resized) if row.target is None else outline(np.asarray(resized), row.target)
-        strip.paste(Image.fromarray(shown), (GAP + index * (TILE_WIDTH + GAP), CAPTION))
+        strip.paste(Image.fromarray(shown), (GAP + index * (TILE_WIDTH + GAP), top))
+    middle, left = top + height + LEGEND // 2, 2 * GAP + TILE_WIDTH  # below the first tile that has these colors
+    font = ImageFont.load_default(TEXT)
+    start = left + round(font.getlength(row.bar.left)) + GAP
+    bar = Image.fromarray(row.bar.colors).resize((BAR_WIDTH, BAR_HEIGHT))
+    strip.paste(bar, (start, middle - BAR_HEIGHT // 2))
+    _write(strip, (left, middle), row.bar.left, TEXT, "lm")
+    _write(strip, (start + BAR_WIDTH + GAP, middle), row.bar.right, TEXT, "lm")
     return strip
 
 
-def _write(canvas: Image.Image, at: tuple[int, int], text: str, size: int, room: int, anchor: str) -> None:
-    """One line of text, smaller where it would be wider than `room`."""
-    font = ImageFont.load_default(size)
-    while font.getlength(text) > room and size > 8:
-        size -= 1
-        font = ImageFont.load_default(size)
-    ImageDraw.Draw(canvas).text(at, text, fill="black", font=font, anchor=anchor)
+def _wrapped(text: str, size: int, room: int) -> list[str]:
+    """The text in lines of at most `room` pixels, broken at spaces, and inside a word that is longer than a line."""
+    font, lines = ImageFont.load_default(size), [""]
+    for word in text.split(" "):
+        if lines[-1] and font.getlength(f"{lines[-1]} {word}") > room:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}" if lines[-1] else word
+        while font.getlength(lines[-1]) > room:
+            kept = next(end for end in range(len(lines[-1]) - 1, 0, -1) if font.getlength(lines[-1][:end]) <= room)
+            lines[-1:] = [lines[-1][:kept], lines[-1][kept:]]
+    return lines
+
+
+def _write(canvas: Image.Image, at: tuple[int, int], text: str, size: int, anchor: str) -> None:
+    ImageDraw.Draw(canvas).text(at, text, fill="black", font=ImageFont.load_default(size), anchor=anchor)
 
 
 def html_figure(caption: str, picture: Image.Image, quality: int) -> str:

@@ -5,6 +5,7 @@ Training writes it beside the adapter, `gift-peft report --model-card` writes it
 """
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -332,7 +333,7 @@ def _eval_results(arguments: Mapping, record: Mapping | None, reports: Sequence[
         _eval_result(name, kind_of, config, key, value)
         for name, kind_of, config, values in entries
         for key, value in values.items()
-        if value is not None
+        if value is not None and math.isfinite(value)  # the Hub refuses a card with a NaN
     ]
 
 

@@ -10,7 +10,12 @@ __all__ = ["make_parser", "run"]
 
 
 def run(argv: Sequence[str]) -> int:
-    arguments = parse_arguments(argv)
+    words = [word for word in argv if word.replace("_", "-") != "--dry-run"]
+    arguments = parse_arguments(words)
+    if len(words) < len(argv):
+        from gift_peft.training.dry_run import dry_run
+
+        return dry_run(arguments)
     from gift_peft.training.loop import train  # after the arguments are known to be right: this takes seconds
 
     result = train(arguments)

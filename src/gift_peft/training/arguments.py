@@ -5,7 +5,6 @@ names those of the Hugging Face examples.
 """
 
 import argparse
-import difflib
 import math
 import re
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ import yaml
 from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.files import read_yaml
 from gift_peft.models.pixels import parse_size
-from gift_peft.options import OptionParser, expand_home
+from gift_peft.options import OptionParser, did_you_mean, expand_home
 
 # What a run may be resumed with when it differs: everything else changes the weights that come out.
 FREE_TO_CHANGE = {
@@ -64,6 +63,17 @@ OWN = {
         "surface_quantile",
         "surface_tau",
     ),
+}
+# The groups of `--help`: the first argument of each, in the order of the dataclass, and its title.
+SECTIONS = {
+    "model_name_or_path": "model, data and output",
+    "head": "what is trained",
+    "target": "what it is trained to, and how many images at once",
+    "gradient_checkpointing": "speed and memory",
+    "num_train_epochs": "length and optimizer",
+    "mixed_precision": "precision, order and reading",
+    "metric_for_best_model": "validation, checkpoints and going on",
+    "report_to": "record and sharing",
 }
 SELECTORS = ("gce", "normalized_gce", "tom_rmse")
 LAMBDA_C = {"consensus": 1.0, "surface": 1.5}
@@ -202,7 +212,7 @@ class GiftTrainingArguments:
         "a checkpoint-<step> folder, or latest: the newest complete one in output_dir", None
     )
     booster_root: str | None = _arg("Booster's folder: ToM and Other RMSE on it at every validation", None)
-    report_to: Literal["none", "tensorboard", "trackio"] = _arg("experiment tracker", "none")
+    report_to: Literal["none", "tensorboard", "trackio", "wandb"] = _arg("experiment tracker", "none")
     license: str | None = _arg("licence named in the card; default: the base model's where known", None)
     push_to_hub: bool = _arg("upload the adapter when training has ended (token: hf auth login)", False)
     hub_model_id: str | None = _arg("repository for the upload; default: the name of output_dir", None)
@@ -288,12 +298,24 @@ class GiftTrainingArguments:
 
 
 def make_parser() -> OptionParser:
-    return OptionParser(
+    parser = OptionParser(
         "train",
-        "Fine-tune a model on groups of images into an adapter.",
+        "Fine-tune a model on groups of images into an adapter; --base, --dataset and --out are needed.",
         "gift-peft train --base depth-anything/Depth-Anything-V2-Small-hf --dataset gift-i --out run",
         parents=[_hf_argument_parser()(GiftTrainingArguments, add_help=False)],
     )
+    text = "say what a run would do, need and miss, and write nothing; exit code 1 if it would fail"
+    parser.add_argument("--dry-run", action="store_true", help=text)
+    # HfArgumentParser knows no groups, so its options are moved into them.
+    parser.usage = "%(prog)s --base ID --dataset ID --out DIR [options]"
+    actions = {action.dest: action for action in parser._actions}
+    group = parser
+    for name in _names():
+        if name in SECTIONS:
+            group = parser.add_argument_group(SECTIONS[name])
+        parser._optionals._group_actions.remove(actions[name])
+        group._group_actions.append(actions[name])
+    return parser
 
 
 def _hf_argument_parser() -> type[argparse.ArgumentParser]:
@@ -319,10 +341,13 @@ def parse_arguments(argv: Sequence[str]) -> GiftTrainingArguments:
     from_file = [] if path is None else _yaml_to_argv(path)
     for option in (word.partition("=")[0] for word in argv if word.startswith("--")):
         if not parser.knows(option):
-            raise ValueError(f"unknown argument {option}{_nearest(option[2:].replace('-', '_'))}")
+            near = did_you_mean(option[2:].replace("-", "_"), _names())
+            raise ValueError(f"unknown argument {option}{near}")
     values, unknown = parser.parse_known_args([*from_file, *argv])
     if unknown:
         raise ValueError(f"unknown argument {unknown[0]}")
+    if values.dry_run:  # `run` of the verb has taken it out
+        raise ValueError("dry_run: only `gift-peft train` has it")
     return GiftTrainingArguments(**{name: getattr(values, name) for name in _names()})
 
 
@@ -337,7 +362,7 @@ def _yaml_to_argv(path: Path) -> list[str]:
     types = {f.name: f.type for f in fields(GiftTrainingArguments)}
     for key, value in values.items():
         if key not in _names() or key == "config":
-            raise ValueError(f"config {path}: unknown key {key!r}{_nearest(str(key))}")
+            raise ValueError(f"config {path}: unknown key {key!r}{did_you_mean(str(key), _names())}")
         if isinstance(value, dict):
             raise ValueError(f"config {path}: {key}: expected a value, not a mapping")
         if isinstance(value, list) and get_origin(types[key]) is not list:
@@ -353,8 +378,3 @@ def _yaml_to_argv(path: Path) -> list[str]:
 
 def _names() -> list[str]:
     return [f.name for f in fields(GiftTrainingArguments)]
-
-
-def _nearest(name: str) -> str:
-    match = difflib.get_close_matches(name, _names(), n=1)
-    return f"; did you mean {match[0]}?" if match else ""

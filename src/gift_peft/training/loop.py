@@ -7,7 +7,7 @@ on) -> finish: the adapter with the smallest validation GCE. With `target: surfa
 
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ from gift_peft.training.start import (
     check_run,
     claim_folder,
     make_accelerator,
+    start_tracker,
     stop_signals,
     tell_lost_processes,
 )
@@ -68,11 +69,14 @@ class TrainResult:
     signal: int | None = None
 
 
-def train(args: GiftTrainingArguments | None = None, **arguments: Any) -> TrainResult:
+def train(
+    args: GiftTrainingArguments | None = None, *, resume_command: str | None = None, **arguments: Any
+) -> TrainResult:
     """Run, or go on with, a training: `train(args)`, or `train(model_name_or_path=..., dataset_name=..., ...)`.
 
     Args:
         args: the arguments as one object.
+        resume_command (*optional*): what is told to type where a signal stops the run; default: `gift-peft train`.
         **arguments: or one by one, under the names of `GiftTrainingArguments`.
 
     Raises:
@@ -87,16 +91,16 @@ def train(args: GiftTrainingArguments | None = None, **arguments: Any) -> TrainR
         raise TypeError(f"train takes GiftTrainingArguments or single arguments, not both: {', '.join(arguments)}")
     accelerator = make_accelerator(args)
     with tell_lost_processes(accelerator, Path(args.output_dir)):
-        return _train(args, accelerator)
+        return _train(args, accelerator, resume_command)
 
 
-def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult:
+def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command: str | None) -> TrainResult:
     # check: what can be known to fail fails before a model is loaded
     output, checkpoint = check_run(args, accelerator)
 
     # load: float32 weights whatever the checkpoint's, bf16 is autocast's business (paper, implementation details)
     base, processor = load_base(args.model_name_or_path, args.model_revision)
-    recipe, kind = _recipe(args, base)
+    recipe, kind = find_recipe(args, base)
     size = resolve_size(args.size, recipe, processor, base.config)
 
     # data
@@ -105,7 +109,7 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
     identity = checkpoints.run_identity(args, [part.dataset for part in groups.values()], size, accelerator)
 
     # objective
-    network, optimizer = _adapted(args, base, recipe, accelerator)
+    network, optimizer = adapt(args, base, recipe, accelerator)
     objective = OBJECTIVES[args.target](args, train_groups, network, optimizer, accelerator)
     optimizer, schedule = objective.optimizer, Schedule(args, objective.epoch_steps)
     if args.profile:
@@ -120,15 +124,14 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
             checkpoint, output, identity, schedule.total_steps, network, optimizer, accelerator
         )
     claim_folder(args, accelerator, fresh=checkpoint is None)
-    if args.report_to != "none":
-        accelerator.init_trackers("gift-peft", {k: str(v) for k, v in asdict(args).items()})
+    start_tracker(args, accelerator)
     trained = sum(p.numel() for p in network.parameters() if p.requires_grad)
     accelerator.print(
         f"{len(train_groups)} train and {len(validation_groups or ())} validation groups at {size[0]}x{size[1]}, "
         f"{schedule.total_steps} updates of {trained / 1e6:.2f} M weights, autocast {accelerator.mixed_precision}"
     )
     if validation_groups is None:
-        accelerator.print("No validation split: adapter/ will be the last adapter, chosen by nothing.")
+        accelerator.print("No validation split: adapter/ will be the last adapter, not the best of several.")
     if checkpoint:
         accelerator.print(f"Going on from {checkpoint} (step {state.step})")
     about = {
@@ -158,14 +161,14 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
 
     # finish
     if signum:
-        accelerator.print(how_to_resume(output, state.step))
+        accelerator.print(how_to_resume(output, state.step, resume_command))
     elif accelerator.is_main_process:
         _finish(args, output, state, save, validated=validation_groups is not None)
     accelerator.end_training()
     return TrainResult(output, state.step, state.rows, state.best_step, signum or None)
 
 
-def _recipe(args: GiftTrainingArguments, base: torch.nn.Module) -> tuple[GiftRecipe, str]:
+def find_recipe(args: GiftTrainingArguments, base: torch.nn.Module) -> tuple[GiftRecipe, str]:
     """(recipe, what the model predicts): the one the arguments spell out, else the one for the model's type."""
     spelled = None
     if args.target_modules:
@@ -217,7 +220,7 @@ def _groups(
     return groups
 
 
-def _adapted(
+def adapt(
     args: GiftTrainingArguments, base: torch.nn.Module, recipe: GiftRecipe, accelerator: Accelerator
 ) -> tuple[PeftModel, torch.optim.Adam]:
     """The base with a fresh adapter, and its optimizer."""

@@ -1,5 +1,6 @@
 """What a run says: on a terminal a bar (loss, GCE, groups/s, time left), always a line per epoch, and how it ended."""
 
+import math
 import shlex
 import sys
 import time
@@ -42,7 +43,7 @@ class Progress:
 
     def row(self, row: dict, epochs: float) -> None:
         """The line of one row of metrics.jsonl."""
-        parts = [f"epoch {row['epoch']:g}/{epochs:g}  step {row['step']}  loss {number(row['loss'])}"]
+        parts = [f"epoch {_epochs(row['epoch'])}/{_epochs(epochs)}  step {row['step']}  loss {number(row['loss'])}"]
         parts.append(f"{self.term} {number(row['train_gce' if self.term == 'GCE' else 'consistency'])}")
         if row["val_gce"] is not None:
             parts.append(f"validation GCE {number(row['val_gce'])}")
@@ -51,7 +52,8 @@ class Progress:
         if self.done > self.first:
             rate = (self.done - self.first) / (time.monotonic() - self.started)
             left = round((self.total - self.done) / rate)
-            parts.append(f"{rate:.2f} {self.unit}s/s  {left // 3600:d}:{left // 60 % 60:02d}:{left % 60:02d} left")
+            speed = f"{rate:.2f} {self.unit}s/s" if rate >= 0.1 else f"{1 / rate:.0f} s per {self.unit}"
+            parts.append(f"{speed}  {left // 3600:d}:{left // 60 % 60:02d}:{left % 60:02d} left")
         self.say("  ".join(parts))
 
     def say(self, text: str) -> None:
@@ -69,22 +71,30 @@ def summary(adapter: Path, rows: list[dict], best_step: int | None, validated: b
     row = next(row for row in reversed(rows) if best_step in (None, row["step"]))
     lines = [f"Adapter: {adapter} (step {row['step']})"]
     if validated and best_step is None:
-        why = "No validation group has a treated reference"
+        why = "No validation group has a photo of the treated surface (reference.*)"
         if metric != "tom_rmse":
-            why = "In no validation group two target masks meet"
-        lines.append(f"  {why}: it is the last adapter, chosen by nothing")
+            why = "No validation group has two photos whose target masks overlap, which GCE compares"
+        lines.append(f"  {why}; so adapter/ is simply the last one, not the best of several")
     for title, key in (("validation GCE", "val_gce"), ("ToM RMSE", "val_tom_rmse"), ("Other RMSE", "val_other_rmse")):
         before, after = rows[0][key], row[key]
         if after is not None:
             change = relative_change(before, after)
-            lines.append(f"  {title:15}{number(before)} -> {number(after)} ({change:+.1f} %)")
+            shown = f" ({change:+.1f} %)" if math.isfinite(change) else ""
+            lines.append(f"  {title:15}{number(before)} -> {number(after)}{shown}")
+    if len(lines) > 1 and rows[0]["val_gce"] is not None:
+        lines.append(
+            "  in the model's own units; RMSE on the validation groups, against its prediction of the treated surface"
+        )
     return "\n".join(lines)
 
 
-def how_to_resume(output: Path, step: int) -> str:
-    """The last lines of a run that a signal has stopped."""
-    config = output / "config.yaml"
-    return (
-        f"Stopped after step {step}; {output}/checkpoint-{step} is complete. Go on with\n"
-        f"  gift-peft train --config {shlex.quote(str(config))} --resume_from_checkpoint latest"
-    )
+def _epochs(count: float) -> str:
+    """Epochs with at most two decimals: 3, 0.67."""
+    return f"{count:.2f}".rstrip("0").rstrip(".")
+
+
+def how_to_resume(output: Path, step: int, command: str | None = None) -> str:
+    """The last lines of a run that a signal has stopped; `command` goes on with it."""
+    config = shlex.quote(str(output / "config.yaml"))
+    command = command or f"gift-peft train --config {config} --resume_from_checkpoint latest"
+    return f"Stopped after step {step}; {output}/checkpoint-{step} is complete. Go on with\n  {command}"

@@ -3,25 +3,34 @@
 Everything that can be known to fail fails here, before a model is loaded.
 """
 
+import math
 import os
+import shlex
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
+import psutil
 import torch
 from accelerate import Accelerator, PartialState
 from accelerate.state import AcceleratorState
 from accelerate.utils import DistributedDataParallelKwargs, ProjectConfiguration, parse_flag_from_env
 
 from gift_peft.evaluation.booster_scenes import find_booster
+from gift_peft.files import reason
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.checkpoints import find_checkpoint, last_complete, remove_leftovers
 from gift_peft.training.run_folder import check_folder, delete_run, holds_run, write_config
 from gift_peft.training.upload import check_push
+
+# How launchers tell a process how many there are: torchrun, Open MPI, MPICH and Intel MPI, MVAPICH, srun.
+WORLD_SIZES = ("WORLD_SIZE", "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
 
 
 def make_accelerator(args: GiftTrainingArguments) -> Accelerator:
@@ -31,7 +40,8 @@ def make_accelerator(args: GiftTrainingArguments) -> Accelerator:
     if precision not in ("no", "bf16"):
         raise ValueError(f"mixed_precision: {precision} (accelerate's setting) is not supported; use bf16 or no")
     if args.report_to != "none" and find_spec(args.report_to) is None:
-        raise ValueError(f"report_to: {args.report_to} is not installed; pip install {args.report_to}")
+        raise ValueError(f"report_to: {args.report_to} is not installed; pip install gift-peft[{args.report_to}]")
+    tell_missing_processes(PartialState().num_processes)
     AcceleratorState._reset_state()  # an earlier run of this process (a notebook) may have had another precision
     logs = Path(args.output_dir) / "logs"
     return Accelerator(
@@ -43,8 +53,61 @@ def make_accelerator(args: GiftTrainingArguments) -> Accelerator:
     )
 
 
-def check_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Path, Path | None]:
+def start_tracker(args: GiftTrainingArguments, accelerator: Accelerator) -> None:
+    """Begin the record of this run at the tracker that `report_to` names, if any; files go to `logs`.
+
+    Raises ValueError with the tracker's own reason: no account, no network.
+    """
+    if args.report_to == "none":
+        return
+    logs = Path(args.output_dir) / "logs"
+    if accelerator.is_main_process:
+        logs.mkdir(parents=True, exist_ok=True)  # wandb writes elsewhere if its folder is not there
+    options = {"wandb": {"dir": str(logs), "name": Path(args.output_dir).resolve().name}}
+    try:
+        accelerator.init_trackers("gift-peft", {key: str(value) for key, value in asdict(args).items()}, options)
+    except Exception as error:  # each tracker has errors of its own
+        more = "; WANDB_MODE=offline records without an account" if args.report_to == "wandb" else ""
+        raise ValueError(f"report_to: {args.report_to} did not start ({reason(error)}){more}") from None
+
+
+def tell_missing_processes(num_processes: int) -> None:
+    """Warn in one line where the launcher announces more processes than there are, with the command that starts them.
+
+    `accelerate launch --cpu --num_processes 2` starts the second by MPI alone: without it, it sets an address for
+    processes to meet at and runs one. Other launchers tell each process how many there are.
+    """
+    told = [int(os.environ[name]) for name in WORLD_SIZES if os.environ.get(name, "").isdigit()]
+    announced = max(told, default=1)
+    if not told and "MASTER_ADDR" in os.environ and "ACCELERATE_MIXED_PRECISION" in os.environ:
+        announced = _asked_of_accelerate()
+    if announced <= num_processes:
+        return
+    count = f"{announced} processes" if announced < math.inf else "several processes"
+    number = str(announced) if announced < math.inf else "N"
+    program, *words = sys.argv
+    if Path(program).name == "gift-peft" or Path(program).parent.name == "training":
+        program, words = "-m gift_peft.training", words[1:] if words[:1] == ["train"] else words
+    cpu = "ACCELERATE_USE_CPU=true " if parse_flag_from_env("ACCELERATE_USE_CPU") else ""
+    command = f"{cpu}torchrun --nproc_per_node {number} {program} {shlex.join(words)}".strip()
+    text = f"the launcher announces {count}, and {num_processes} is at work; start them with  {command}"
+    print(f"gift-peft: warning: {text}", file=sys.stderr)
+
+
+def _asked_of_accelerate() -> float:
+    """The `--num_processes` of the `accelerate launch` above this process; infinite where it is not on its line."""
+    try:
+        words = [word.replace("-", "_") for word in psutil.Process().parent().cmdline()]
+        value = words[words.index("__num_processes") + 1]
+    except (psutil.Error, AttributeError, ValueError, IndexError):
+        return math.inf
+    return int(value) if value.isdigit() else math.inf
+
+
+def check_run(args: GiftTrainingArguments, accelerator: Accelerator, prepare: bool = True) -> tuple[Path, Path | None]:
     """(output folder, checkpoint to go on from or None). Changes nothing but leftovers of a killed run.
+
+    Without `prepare` not even those are removed, nor the output folder made.
 
     Raises ValueError if the folder holds a run that the arguments neither resume nor overwrite, or files in the run's
     way that no run wrote, OSError if it cannot be written, and either for a bad Booster root.
@@ -53,7 +116,7 @@ def check_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Pa
     check_push(args)
     if output.exists() and not output.is_dir():
         raise ValueError(f"output_dir: {output} is a file")
-    if accelerator.is_main_process and output.is_dir():
+    if prepare and accelerator.is_main_process and output.is_dir():
         remove_leftovers(output)
     accelerator.wait_for_everyone()
     checkpoint = None
@@ -70,8 +133,10 @@ def check_run(args: GiftTrainingArguments, accelerator: Accelerator) -> tuple[Pa
             "--overwrite_output_dir deletes it"
         )
     check_folder(output, args)
-    output.mkdir(parents=True, exist_ok=True)
-    if not os.access(output, os.W_OK):
+    if prepare:
+        output.mkdir(parents=True, exist_ok=True)
+    place = next(folder for folder in (output.absolute(), *output.absolute().parents) if folder.exists())
+    if not os.access(place, os.W_OK):
         raise PermissionError(f"output_dir: {output} cannot be written")
     if args.booster_root is not None:
         find_booster(args.booster_root)

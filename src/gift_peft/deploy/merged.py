@@ -1,0 +1,167 @@
+"""`gift-peft deploy --to transformers`: base and adapter as one plain model, equal to the adapter up to rounding.
+
+A folder that transformers, its pipeline and every tool that reads such folders load as they load the base.
+"""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from peft import PeftModel
+
+from gift_peft.adapters.folder import processor_at_size, read_adapter_config, read_gift
+from gift_peft.files import is_hub_id, portable_name, reason, whole_folder
+from gift_peft.models.loading import DepthModel
+from gift_peft.reports.model_card import base_license
+
+TOLERANCE = 1e-5  # largest difference to the adapter, relative to the output's mean
+TEMPLATES = Path(__file__).parent / "templates"
+OWN = ("config.json", "preprocessor_config.json", "processor_config.json", "*.safetensors*", "README.md", "*.py")
+
+
+def adapter_base(adapter: str | Path) -> str:
+    """The base that an adapter names.
+
+    Raises FileNotFoundError where it is not here, ValueError if the adapter names none.
+    """
+    base = read_adapter_config(adapter).base_model_name_or_path
+    if not base:
+        raise ValueError(f"adapter {adapter} names no base model: give --base")
+    if not Path(base).is_dir() and not is_hub_id(base):
+        raise FileNotFoundError(f"adapter {adapter} was trained on {base}, which is not here: give --base")
+    return base
+
+
+def load_for_deployment(
+    adapter: str | Path,
+    base: str | Path | None = None,
+    adapter_scale: float = 1.0,
+    revision: str | None = None,
+    size: str | tuple[int, int] | None = None,
+    kind: str | None = None,
+) -> DepthModel:
+    """The adapter on its base, on the CPU, at a scale.
+
+    Args:
+        adapter: folder or hub id.
+        base (*optional*): default the one that the adapter names.
+        adapter_scale (`float`): 0 is the base, 1 the adapter.
+        revision, size, kind: as in `DepthModel.from_pretrained`.
+
+    Raises:
+        FileNotFoundError: no such adapter or base. ValueError: the adapter is of another base; a scale outside 0..1.
+    """
+    check_scale(adapter_scale)
+    base = adapter_base(adapter) if base is None else base
+    if revision is None and base == read_adapter_config(adapter).base_model_name_or_path:
+        revision = read_adapter_config(adapter).revision
+    return DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device="cpu")
+
+
+def check_scale(scale: float) -> None:
+    """ValueError unless a scale is from 0 to 1: outside, the output is of no model that was trained."""
+    if not 0 <= scale <= 1:
+        raise ValueError(f"adapter scale {scale:g}: it goes from 0 (the base) to 1 (the adapter)")
+
+
+def merged(model: DepthModel) -> DepthModel:
+    """A `DepthModel` whose network is one plain model; `model` is taken apart for it.
+
+    Raises ValueError, with the reason, where that is not the same: another precision, a layer that PEFT cannot merge,
+    or an output that differs by more than 1e-5 of its mean.
+    """
+    network = model.network
+    if not isinstance(network, PeftModel):
+        raise ValueError("only a model with an adapter can be merged")
+    half = sorted({str(weight.dtype) for weight in network.parameters() if weight.dtype != torch.float32})
+    if half:
+        raise ValueError(f"the base has weights of {', '.join(half)}: a merged weight would be rounded; load float32")
+    pixels = torch.rand(1, 3, *model.size, generator=torch.Generator().manual_seed(0))
+    expected = model.predict(pixels)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            plain = network.merge_and_unload(safe_merge=True)
+        except (ValueError, NotImplementedError, RuntimeError, AttributeError) as error:
+            raise ValueError(f"the adapter cannot be merged into its base: {reason(error)}") from None
+    result = DepthModel(plain.eval(), model.processor, model.size, model.kind)
+    difference = (result.predict(pixels) - expected).abs().max().item() / expected.abs().mean().clamp(min=1e-30).item()
+    if not difference <= TOLERANCE:  # NaN as well
+        raise ValueError(f"the merged model differs from the adapter by {difference:.1e} of the output's mean")
+    return result
+
+
+def deploy_transformers(adapter: str | Path, out: str | Path, base: str | Path | None = None, **options: Any) -> Path:
+    """Write `out`, a plain transformers folder with image processor and card; returns it.
+
+    Args: as `load_for_deployment`. Raises as that and as `merged`, and ValueError if `out` holds other files.
+    """
+    out, base = Path(out), adapter_base(adapter) if base is None else base
+    check_new(out, OWN)
+    model = merged(load_for_deployment(adapter, base, **options))
+    with whole_folder(out) as temporary:
+        model.network.save_pretrained(temporary)
+        processor_at_size(model.processor, model.size).save_pretrained(temporary)
+        scale = options.get("adapter_scale", 1.0)
+        (temporary / "README.md").write_text(_card(model, adapter, base, scale), encoding="utf-8")
+        check_new(out, OWN)
+    return out
+
+
+def check_new(folder: Path, own: tuple[str, ...]) -> None:
+    """ValueError if a folder that is to be written holds files that match none of the patterns `own`."""
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"{folder} is a file: name a folder")
+    others = (
+        [path.name for path in folder.iterdir() if not any(path.match(pattern) for pattern in own)]
+        if folder.exists()
+        else []
+    )
+    if others:
+        raise ValueError(f"{folder} holds other files ({', '.join(sorted(others)[:3])}): name a new folder")
+
+
+def license_of(adapter: str | Path, base: str | Path) -> str:
+    """A Hub license id: what the adapter's card says, else that of the base; `other` where neither is known."""
+    card = Path(adapter) / "README.md"
+    if card.is_file():
+        from huggingface_hub import ModelCard
+
+        try:
+            stated = ModelCard.load(card).data.license
+        except (ValueError, yaml.YAMLError):
+            stated = None
+        if stated:
+            return str(stated)
+    return base_license(str(base))
+
+
+def unit_of(model: DepthModel) -> str:
+    """What the numbers of a prediction are, in words."""
+    if model.known_kind() == "inverse_depth":
+        return "relative inverse depth: larger is nearer, without a unit"
+    if model.millimeters_per_unit == 1000 or getattr(model.network.config, "model_type", "") == "gift_metric3d":
+        return "depth in meters"
+    return "relative depth: larger is farther, without a unit"
+
+
+def _card(model: DepthModel, adapter: str | Path, base: str | Path, scale: float) -> str:
+    from jinja2 import Environment
+
+    template = Environment(keep_trailing_newline=True).from_string((TEMPLATES / "merged.md").read_text("utf-8"))
+    code = getattr(model.network.config, "model_type", "").startswith("gift_")
+    return template.render(
+        base=portable_name(base),
+        hub_base=str(base) if is_hub_id(base) else None,
+        adapter=portable_name(adapter),
+        license=license_of(adapter, base),
+        scale=scale,
+        kind=model.known_kind(),
+        unit=unit_of(model),
+        height=model.size[0],
+        width=model.size[1],
+        own_code=code,
+        versions=read_gift(adapter).get("versions") or {},
+    )

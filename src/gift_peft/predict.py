@@ -7,7 +7,7 @@ prediction back to each picture's size, as in transformers' pipeline. Values sta
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def predict_images(
     images: Sequence[str | Path],
-    base: str | Path,
+    base: str | Path | None = None,
     adapter: str | Path | None = None,
     adapter_scale: float | None = None,
     *,
@@ -33,6 +33,8 @@ def predict_images(
     revision: str | None = None,
     focal_length: float | tuple[float, float] | None = None,
     device: "str | torch.device | None" = None,
+    deployed: str | Path | None = None,
+    backend: str | None = None,
     progress: bool = True,
 ) -> list[Path]:
     """Writes `<stem>.npy` and `<stem>.png` per picture and, with an adapter, `<stem>_base.npy/.png` beside them.
@@ -47,6 +49,8 @@ def predict_images(
         out: folder; made if missing, existing files of these names are replaced.
         kind (`str`, *optional*): decides which end is bright; default the recipe's.
         focal_length (*optional*): of the camera in pixels, as in `DepthModel.depth_at`.
+        deployed (*optional*): a folder that `gift-peft deploy` exported, in place of base and adapter.
+        backend (`str`, *optional*): what computes a deployed model, `onnx` or `openvino`.
 
     Returns:
         `list[Path]`: the npy file of each picture.
@@ -56,18 +60,27 @@ def predict_images(
             non-finite prediction, an adapter for another base.
     """
     from gift_peft.colormap import color_range, colorize  # not for `--help`, which needs neither OpenCV nor torch
-    from gift_peft.models.loading import DepthModel
 
     files = list_images(images)
-    names = _unique_names(files, beside=adapter is not None)
-    model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
+    model: Any
+    if deployed is not None:
+        from gift_peft.deploy.deployed import DeployedModel
+
+        model = DeployedModel(deployed, backend, adapter_scale)
+    elif base is None:
+        raise ValueError("predict needs a base or a deployed folder")
+    else:
+        from gift_peft.models.loading import DepthModel
+
+        model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
+    names = _unique_names(files, beside=model.adapted)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     for file, name in tqdm(
         list(zip(files, names, strict=True)), desc="predict", unit="image", disable=None if progress else True
     ):
         depths = {name: model.depth_at(file, focal_length)}
-        if adapter is not None:
+        if model.adapted:
             depths[f"{name}_base"] = model.depth_at(file, focal_length, base=True)
         low, high = color_range(*depths.values())
         for stem, depth in depths.items():
@@ -107,16 +120,30 @@ def make_parser() -> OptionParser:
         "gift-peft predict photo.jpg --base demo/base --adapter demo/adapter --out depth",
     )
     parser.add_argument("images", nargs="+", metavar="IMAGE", help="picture files or folders of them")
-    add_base(parser)
+    add_base(parser, required=False)
     add_adapter(parser)
     text = "of the camera that took the pictures, where the model takes one (Metric3D)"
     parser.add_argument("--focal-length", type=float, metavar="PIXELS", help=text)
+    text = "a folder of `gift-peft deploy --to onnx|openvino|int8`, in place of --base and --adapter"
+    parser.add_argument("--deployed", metavar="DIR", help=text)
+    text = "what computes a deployed model; default: what it was exported for"
+    parser.add_argument("--backend", choices=["onnx", "openvino"], help=text)
     parser.add_argument("--out", "--output-dir", required=True, metavar="DIR", help="folder for the npy and png files")
     return parser
 
 
 def run(argv: Sequence[str]) -> int:
-    args = make_parser().parse_args(argv)
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    if args.deployed is None and args.base is None:
+        parser.error("the following arguments are required: --base/--model-name-or-path, or --deployed")
+    if args.deployed is not None:
+        fixed = ("base", "adapter", "revision", "size", "kind")
+        given = [f"--{name}" for name in fixed if getattr(args, name) is not None]
+        if given:
+            parser.error(f"--deployed brings its own model: leave {', '.join(given)} out")
+    elif args.backend is not None:
+        parser.error("--backend computes a model named by --deployed")
     files = predict_images(
         args.images,
         args.base,
@@ -127,6 +154,8 @@ def run(argv: Sequence[str]) -> int:
         kind=args.kind,
         revision=args.revision,
         focal_length=args.focal_length,
+        deployed=args.deployed,
+        backend=args.backend,
     )
     print(f"Depth maps written to {args.out}: {len(files)}")
     return 0

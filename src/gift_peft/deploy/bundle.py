@@ -101,13 +101,18 @@ def prepare_bundle(
     base: str | Path | None,
     form: str,
     *,
+    own: tuple[str, ...] = OWN,
     dial: bool = False,
     adapter_scale: float = 1.0,
     **options: Any,
 ) -> Bundle:
-    """Load, describe and merge (or dial); raises as `load_for_deployment` and `merged` do."""
+    """Load, describe and merge (or dial).
+
+    `own` are the files of `out` that may be replaced. Raises as `load_for_deployment` and `merged` do, and ValueError
+    where `out` holds other files.
+    """
     out, base = Path(out), adapter_base(adapter) if base is None else base
-    check_new(out, OWN)
+    check_new(out, own)
     model = load_for_deployment(adapter, base, adapter_scale, **options)
     settings = _settings(model, dial)
     multiple = settings["multiple_of"]

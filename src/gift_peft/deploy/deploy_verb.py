@@ -38,6 +38,8 @@ def make_parser() -> OptionParser:
     parser.add_argument("--kind", choices=["depth", "inverse_depth"], help="what is predicted, if no recipe says it")
     text = "a second input, adapter_scale, goes from the base (0) to the adapter (1): one file for both"
     parser.add_argument("--dial", action="store_true", help=text)
+    text = "photos for the page of a Space; default: some of the embedded groups"
+    parser.add_argument("--examples", nargs="+", default=[], metavar="PHOTO", help=text)
     return parser
 
 
@@ -53,8 +55,12 @@ def run(argv: Sequence[str]) -> int:
         options["adapter_scale"] = 1.0 if args.adapter_scale is None else args.adapter_scale
         if args.dial:
             options["dial"] = True
-    elif args.adapter_scale is not None:
-        parser.error("--adapter-scale: the page of a Space has a slider for it")
+        if args.examples:
+            parser.error("--examples are of --to space")
+    else:
+        if args.adapter_scale is not None:
+            parser.error("--adapter-scale: the page of a Space has a slider for it")
+        options["examples"] = args.examples
     module, function = FORMS[args.to]
     deploy = getattr(import_module(f"gift_peft.deploy.{module}"), function)
     print(f"Written: {deploy(args.adapter, args.out, args.base, **options)}")

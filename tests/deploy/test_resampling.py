@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from gift_peft.deploy.resampling import resample, resampled_by_matrices
 
-SIDES = st.integers(1, 40)
+SIDES = st.integers(2, 40)  # torch's antialiased resize of pictures one pixel wide is wrong: it repeats the first row
 WAYS = [
     {"mode": "nearest"},
     {"mode": "bilinear", "align_corners": False},

@@ -146,8 +146,8 @@ def main() -> None:
         f"({facts['cpu']}), {facts['threads']} threads, load {facts['load_at_start']:.1f} when it started. "
         f"torch {facts['torch']}, transformers {facts['transformers']}, gift-peft {facts['gift-peft']}.",
         "",
-        f"Depth Anything V2-Small with random weights at 518x518, one picture at a time, {args.repeats} repeats in which all run in turn; "
-        "median (smallest-largest). Differences are to torch, over the output's mean.",
+        f"Depth Anything V2-Small with random weights at 518x518, one picture at a time, {args.repeats} repeats in "
+        "which all run in turn; median (smallest-largest). Differences are to torch, over the output's mean.",
         "",
     ]
     with tempfile.TemporaryDirectory() as scratch:

@@ -136,7 +136,7 @@ def test_a_folder_with_other_files_is_kept(run, demo, tmp_path):
 
 def test_what_is_not_exact_is_refused(demo, tmp_path, monkeypatch):
     model = DepthModel(get_gift_model(tiny_model()), DepthModel.from_pretrained(demo / "base").processor)
-    merge = type(model.network).merge_and_unload
+    merge = type(model.network.base_model).merge_and_unload
 
     def inexact(self, **options):
         plain = merge(self, **options)
@@ -144,7 +144,7 @@ def test_what_is_not_exact_is_refused(demo, tmp_path, monkeypatch):
             plain.head.conv3.bias.add_(1e-3)
         return plain
 
-    monkeypatch.setattr(type(model.network), "merge_and_unload", inexact)
+    monkeypatch.setattr(type(model.network.base_model), "merge_and_unload", inexact)
     with pytest.raises(ValueError, match=r"differs from the adapter by .* of the output's mean"):
         merging.merged(model)
     half = DepthModel(get_gift_model(tiny_model()).to(torch.bfloat16), model.processor)

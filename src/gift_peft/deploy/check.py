@@ -36,7 +36,7 @@ def _difference(index: int, expected: list[np.ndarray], output: np.ndarray | Non
     if output is None:
         return np.inf, "no output"
     output = np.asarray(output)
-    if output.size == right.size and output.shape != right.shape and 1 in output.shape:
+    if [side for side in output.shape if side > 1] == [side for side in right.shape if side > 1]:
         output = output.reshape(right.shape)  # a channel of one, or no batch
     if output.shape != right.shape:
         same = [other for other in outputs if other is not None and np.shape(other) == output.shape]
@@ -51,26 +51,27 @@ def _difference(index: int, expected: list[np.ndarray], output: np.ndarray | Non
     worst = float(errors.max())
     place = _place(np.unravel_index(int(errors.argmax()), errors.shape))
     text = f"largest difference {worst:.1e} of the mean at {place}, on average {errors.mean():.1e}"
-    return worst, text + (f"; {hint}" if worst > TOLERANCE and (hint := _hint(output, right, expected, worst)) else "")
+    return worst, text + (f"; {hint}" if worst > TOLERANCE and (hint := _hint(index, output, expected, worst)) else "")
 
 
-def _hint(output: np.ndarray, right: np.ndarray, expected: list[np.ndarray], worst: float) -> str:
+def _hint(index: int, output: np.ndarray, expected: list[np.ndarray], worst: float) -> str:
     """What a wrong output looks like."""
+    right = expected[index].astype(np.float64)
     if not output.any():
         return "all zero"
     if np.ptp(output) < 1e-6 * max(abs(output.mean()), 1e-30):
         return "the same number everywhere: did the input arrive?"
-    others = [k for k, other in enumerate(expected) if other.shape == right.shape and np.allclose(other, output, 1e-3)]
-    if others:
-        return f"it is the reference of pair {others[0]}: are the inputs in order?"
+    if worst < HALF:
+        return "of the size that 16-bit or 8-bit arithmetic makes"
+    for other, pair in enumerate(expected):
+        if other != index and pair.shape == output.shape and np.allclose(pair, output, rtol=1e-3):
+            return f"it is the reference of pair {other}: are the inputs in order?"
     for name, turned in (("upside down", right[:, ::-1]), ("mirrored", right[..., ::-1])):
         if np.allclose(turned, output, rtol=1e-3):
             return name
     factor = float((output * right).sum() / max((right * right).sum(), 1e-30))
     if np.abs(output - factor * right).max() < 1e-3 * np.abs(output).mean():
         return f"the reference times {factor:.4g}"
-    if worst < HALF:
-        return "of the size that 16-bit or 8-bit arithmetic makes"
     bad = np.abs(output - right) > 1e-3 * np.abs(right).mean()
     rows, columns = np.flatnonzero(bad.any(axis=(0, 2))), np.flatnonzero(bad.any(axis=(0, 1)))
     return (

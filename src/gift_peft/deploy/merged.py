@@ -3,6 +3,7 @@
 A folder that transformers, its pipeline and every tool that reads such folders load as they load the base.
 """
 
+import json
 import warnings
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,14 @@ import torch
 import yaml
 from peft import PeftModel
 
-from gift_peft.adapters.folder import processor_at_size, read_adapter_config, read_gift
-from gift_peft.files import is_hub_id, portable_name, reason, whole_folder
+from gift_peft.adapters.folder import GIFT, processor_at_size, read_adapter_config, versions
+from gift_peft.files import is_hub_id, portable_name, reason, whole_folder, write_whole
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.model_card import base_license
 
 TOLERANCE = 1e-7  # largest difference to the adapter in float64, relative to the output's mean
 TEMPLATES = Path(__file__).parent / "templates"
-OWN = ("config.json", "preprocessor_config.json", "processor_config.json", "*.safetensors*", "README.md", "*.py")
+OWN = ("config.json", "preprocessor_config.json", "processor_config.json", "*.safetensors*", "README.md", GIFT, "*.py")
 
 
 def adapter_base(adapter: str | Path) -> str:
@@ -105,6 +106,9 @@ def deploy_transformers(adapter: str | Path, out: str | Path, base: str | Path |
         model.network.save_pretrained(temporary)
         processor_at_size(model.processor, model.size).save_pretrained(temporary)
         scale = options.get("adapter_scale", 1.0)
+        # What transformers' files have no place for, and `DepthModel` reads.
+        facts = {"versions": versions(), "size": model.size, "kind": model.known_kind(), "adapter_scale": scale}
+        write_whole(temporary / GIFT, json.dumps(facts, indent=2) + "\n")
         (temporary / "README.md").write_text(_card(model, adapter, base, scale), encoding="utf-8")
         check_new(out, OWN)
     return out
@@ -163,5 +167,4 @@ def _card(model: DepthModel, adapter: str | Path, base: str | Path, scale: float
         height=model.size[0],
         width=model.size[1],
         own_code=code,
-        versions=read_gift(adapter).get("versions") or {},
     )

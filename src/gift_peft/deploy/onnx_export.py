@@ -178,6 +178,10 @@ def quantize(bundle: Bundle, folder: Path) -> None:
     path, data, whole = folder / "model.onnx", folder / "model.onnx.data", folder / "whole.onnx"
     large = data.exists()
     onnx.save(onnx.load(path), whole, save_as_external_data=large, location="whole.onnx.data")
+    # The table of positions is a constant that is resized, no weight.
+    graph = onnx.load(whole, load_external_data=False).graph
+    constants = {tensor.name: len(tensor.dims) for tensor in graph.initializer}
+    kept = [node.name for node in graph.node if node.op_type == "MatMul" and constants.get(node.input[1], 2) != 2]
     error = math.inf
     for types in INT8_TYPES:
         for file in (path, data):
@@ -189,6 +193,7 @@ def quantize(bundle: Bundle, folder: Path) -> None:
                 op_types_to_quantize=types,
                 per_channel=True,
                 weight_type=QuantType.QInt8,
+                nodes_to_exclude=kept,
                 use_external_data_format=large,
                 extra_options={"MatMulConstBOnly": True},  # two activations stay float
             )

@@ -127,6 +127,9 @@ class DepthModel:
             network, processor = load_external(base)
         else:
             network, processor = load_base(base, revision)
+        if adapter is None and Path(base).is_dir():  # a merged model says at what size it was trained
+            merged = read_gift(base)
+            size, kind = size or merged.get("size"), kind or _stated_kind(network) or merged.get("kind")
         if adapter is not None:
             network, processor = _attach(network, processor, base, adapter, revision)
             kind = kind or _stated_kind(network) or read_gift(adapter).get("kind")

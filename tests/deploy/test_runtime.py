@@ -1,8 +1,11 @@
 """What travels with an export, without torch: preprocessing to the bit, resizing back, words for bad input."""
 
 import json
+import os
+import shutil
 import subprocess
 import sys
+from importlib.metadata import version
 from types import SimpleNamespace
 
 import numpy as np
@@ -171,6 +174,32 @@ def test_no_torch_is_imported(folder, photo, tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+@pytest.mark.slow
+def test_a_small_environment_is_enough(folder, photo, tmp_path):
+    """Without torch, under 250 MB, from the registry; its preprocessing has the same bits."""
+    out = folder()
+    shutil.copy(runtime.__file__, out / "predictor.py")
+    venv = tmp_path / "venv"
+    subprocess.run([sys.executable, "-m", "venv", venv], check=True)
+    packages = [f"{name}=={version(name)}" for name in ("numpy", "pillow", "onnxruntime")]
+    subprocess.run([venv / "bin" / "pip", "install", "-q", *packages], check=True)
+    (site,) = venv.glob("lib/python*/site-packages")
+    tools = {path for name in ("pip", "setuptools") for path in site.glob(f"{name}*")}
+    files = [path for path in site.rglob("*") if path.is_file() and not tools & set(path.parents)]
+    assert sum(path.stat().st_size for path in files) < 250e6
+    lines = (
+        "import sys, numpy; from predictor import Predictor, read_picture; p = Predictor('.'); "
+        f"numpy.save('x.npy', p.prepare(read_picture({str(photo)!r}, 'photo'))); assert 'torch' not in sys.modules"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    python = venv / "bin" / "python"
+    subprocess.run([python, "-c", lines], cwd=out, check=True, env=environment)
+    right = DepthModel(network(), tiny_processor(), (56, 70), "inverse_depth").inputs([read_image(photo)])
+    assert np.array_equal(np.load(out / "x.npy"), right.numpy())
+    done = subprocess.run([python, out / "predictor.py", photo, "--out", tmp_path / "depth"], env=environment)
+    assert done.returncode == 0 and (tmp_path / "depth" / "photo_depth.npy").is_file()
 
 
 # ---- bad input ----

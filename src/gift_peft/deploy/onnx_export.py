@@ -11,6 +11,8 @@ import io
 import logging
 import math
 import re
+import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -85,7 +87,8 @@ def require_onnx() -> None:
 
 @contextlib.contextmanager
 def stages(count: int) -> Iterator[Any]:
-    """A progress bar whose steps have names; the time since the start runs on."""
+    """A progress bar whose steps have names; on a terminal its clock runs on within a step."""
+    ended = threading.Event()
     with tqdm(total=count, bar_format="deploy: {n_fmt}/{total_fmt} {desc} [{elapsed}]", mininterval=0) as bar:
 
         def stage(name: str) -> None:
@@ -93,7 +96,17 @@ def stages(count: int) -> Iterator[Any]:
             bar.update(1)
             bar.refresh()
 
-        yield stage
+        def tick() -> None:
+            while not ended.wait(1):
+                bar.refresh()
+
+        clock = threading.Thread(target=tick, daemon=True)
+        if sys.stderr.isatty():
+            clock.start()
+        try:
+            yield stage
+        finally:
+            ended.set()
 
 
 def write_onnx(bundle: Bundle, path: Path) -> None:

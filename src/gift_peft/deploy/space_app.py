@@ -17,8 +17,11 @@ import numpy as np
 from PIL import Image
 
 HERE = Path(__file__).parent
-# Viridis at nine places: uniform to the eye, readable by color-blind people.
-VIRIDIS = ("440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725")
+# Viridis at 17 places: uniform to the eye, readable by color-blind people.
+VIRIDIS = (
+    *("440154", "48186a", "472d7b", "424086", "3b528b", "33638d", "2c728e", "26828e", "21918c"),
+    *("1f9f88", "27ad81", "3dbc74", "5cc863", "81d34d", "aadc32", "d5e21a", "fde725"),
+)
 MESH_SIDE = 320  # points along the longer side of the scene
 MAX_SIDE = 1280  # of a photo: larger ones are made smaller, a page needs no more
 EDGE = 0.06  # neighbors whose distances differ by more than this share are not connected

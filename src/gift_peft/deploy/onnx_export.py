@@ -11,8 +11,6 @@ import io
 import logging
 import math
 import re
-import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -27,6 +25,7 @@ from gift_peft.deploy.dial import INPUT
 from gift_peft.deploy.merged import check_new
 from gift_peft.deploy.resampling import resampled_by_matrices
 from gift_peft.deploy.runtime import MODEL_ID
+from gift_peft.deploy.stages import stages
 from gift_peft.files import reason, whole_folder
 
 OPSET = 20  # the first with Gelu
@@ -83,30 +82,6 @@ def require_onnx() -> None:
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise ValueError(f'{error.name} is not installed: pip install "gift-peft[onnx]"') from None
-
-
-@contextlib.contextmanager
-def stages(count: int) -> Iterator[Any]:
-    """A progress bar whose steps have names; on a terminal its clock runs on within a step."""
-    ended = threading.Event()
-    with tqdm(total=count, bar_format="deploy: {n_fmt}/{total_fmt} {desc} [{elapsed}]", mininterval=0) as bar:
-
-        def stage(name: str) -> None:
-            bar.set_description_str(name, refresh=False)
-            bar.update(1)
-            bar.refresh()
-
-        def tick() -> None:
-            while not ended.wait(1):
-                bar.refresh()
-
-        clock = threading.Thread(target=tick, daemon=True)
-        if sys.stderr.isatty():
-            clock.start()
-        try:
-            yield stage
-        finally:
-            ended.set()
 
 
 def write_onnx(bundle: Bundle, path: Path) -> None:

@@ -9,8 +9,9 @@ from typing import Any
 
 from gift_peft.deploy.bundle import OWN, prepare_bundle, write_bundle
 from gift_peft.deploy.merged import check_new
-from gift_peft.deploy.onnx_export import require_onnx, stages, write_onnx
+from gift_peft.deploy.onnx_export import require_onnx, write_onnx
 from gift_peft.deploy.runtime import MODEL_ID
+from gift_peft.deploy.stages import stages
 from gift_peft.files import reason, whole_folder
 
 

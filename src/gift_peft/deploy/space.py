@@ -15,7 +15,8 @@ from gift_peft.deploy import space_app
 from gift_peft.deploy.bundle import OWN as EXPORTED
 from gift_peft.deploy.bundle import Bundle, prepare_bundle, write_bundle
 from gift_peft.deploy.merged import adapter_base, check_new
-from gift_peft.deploy.onnx_export import require_onnx, stages, write_onnx
+from gift_peft.deploy.onnx_export import require_onnx, write_onnx
+from gift_peft.deploy.stages import stages
 from gift_peft.files import is_hub_id, portable_name, whole_folder
 from gift_peft.images import list_images, read_image
 from gift_peft.options import package_version

@@ -13,11 +13,14 @@ import yaml
 from peft import PeftModel
 
 from gift_peft.adapters.folder import GIFT, processor_at_size, read_adapter_config, versions
+from gift_peft.adapters.recipes import RECIPES
+from gift_peft.deploy.stages import stages
 from gift_peft.files import is_hub_id, portable_name, reason, whole_folder, write_whole
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.model_card import base_license
 
 TOLERANCE = 1e-7  # largest difference to the adapter in float64, relative to the output's mean
+SMALL = 84, 112  # pixels, for that comparison
 TEMPLATES = Path(__file__).parent / "templates"
 OWN = ("config.json", "preprocessor_config.json", "processor_config.json", "*.safetensors*", "README.md", GIFT, "*.py")
 
@@ -80,7 +83,9 @@ def merged(model: DepthModel) -> DepthModel:
     half = sorted({str(weight.dtype) for weight in network.parameters() if weight.dtype != torch.float32})
     if half:
         raise ValueError(f"the base has weights of {', '.join(half)}: a merged weight would be rounded; load float32")
-    pixels = torch.rand(1, 3, *model.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    # The networks with a recipe take any size, and a small one shows as much.
+    size = SMALL if getattr(network.config, "model_type", None) in RECIPES else model.size
+    pixels = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -101,8 +106,12 @@ def deploy_transformers(adapter: str | Path, out: str | Path, base: str | Path |
     """
     out, base = Path(out), adapter_base(adapter) if base is None else base
     check_new(out, OWN)
-    model = merged(load_for_deployment(adapter, base, **options))
-    with whole_folder(out) as temporary:
+    with stages(3) as stage, whole_folder(out) as temporary:
+        stage("the model")
+        model = load_for_deployment(adapter, base, **options)
+        stage("merging, and comparing with the adapter")
+        model = merged(model)
+        stage("writing")
         model.network.save_pretrained(temporary)
         processor_at_size(model.processor, model.size).save_pretrained(temporary)
         scale = options.get("adapter_scale", 1.0)

@@ -1,12 +1,13 @@
 """Adapters whose every weight has moved, as folders, and exports of them."""
 
+import copy
 from pathlib import Path
 
 import numpy as np
 import torch
 from helpers.adapted import trained
 
-from gift_peft import get_gift_model, save_adapter
+from gift_peft import DepthModel, get_gift_model, save_adapter
 
 
 def write_adapter(folder: Path, base, processor, size, head="full") -> Path:
@@ -29,3 +30,14 @@ def pixels(batch: int, height: int, width: int) -> torch.Tensor:
     coarse = torch.rand(batch, 3, 5, 6, generator=generator)
     smooth = torch.nn.functional.interpolate(coarse, (height, width), mode="bicubic", align_corners=False)
     return 3 * (smooth + 0.1 * torch.randn(batch, 3, height, width, generator=generator)) - 1.5
+
+
+def limit(model: DepthModel, x: torch.Tensor) -> float:
+    """How far from torch a right graph may be: 1e-5, or what torch itself is from float64, three times.
+
+    The tiny random networks multiply rounding, Metric3D's recurrence most; a trained one does not.
+    """
+    single = model.predict(x).numpy()
+    with torch.no_grad():
+        double = copy.deepcopy(model.network).double()(pixel_values=x.double()).predicted_depth.numpy()
+    return max(1e-5, 3 * relative(single, double))

@@ -111,13 +111,13 @@ def test_bad_arguments(run, demo, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_base_that_is_gone_asks_for_base(run, demo, tmp_path):
+def test_a_base_that_is_gone(run, demo, tmp_path):
     shutil.copytree(demo, tmp_path / "moved")
     config = tmp_path / "moved" / "adapter" / "adapter_config.json"
     stated = json.loads(config.read_text())
-    config.write_text(json.dumps(stated | {"base_model_name_or_path": "/nowhere/base"}))
+    config.write_text(json.dumps(stated | {"base_model_name_or_path": "/nowhere/other"}))
     code, said = run(tmp_path / "moved" / "adapter", tmp_path / "out", "--to", "transformers")
-    assert code == 1 and "/nowhere/base" in said.err and "--base" in said.err
+    assert code == 1 and "/nowhere/other" in said.err.splitlines()[-1]
     code, _ = run(
         tmp_path / "moved" / "adapter", tmp_path / "out", "--to", "transformers", "--base", tmp_path / "moved" / "base"
     )

@@ -25,20 +25,19 @@ from gift_peft.deploy import check, runtime
 from gift_peft.deploy.dial import INPUT, DialedNetwork, PlainNetwork
 from gift_peft.deploy.merged import (
     TEMPLATES,
-    adapter_base,
-    check_new,
     license_of,
     load_for_deployment,
     merged,
     unit_of,
 )
-from gift_peft.files import portable_name
+from gift_peft.files import check_replaceable, portable_name
+from gift_peft.models.adapter_base import find_base
 from gift_peft.models.loading import RESIZED_HERE, DepthModel
 from gift_peft.models.pixels import pixel_settings, size_multiple
 
 OWN = (
     *("model.onnx", "model.onnx.data", "model.xml", "model.bin"),
-    *("preprocess.json", "reference.npz", "predictor.py", "check.py", "README.md", "__pycache__"),
+    *("preprocess.json", "reference.npz", "predictor.py", "check.py", "README.md", "__pycache__/*"),
 )
 DIALED_SCALES = (1.0, 0.0, 0.5)  # of the reference pairs
 ALARM = 1e-4  # a graph that is farther from torch than rounding could bring it is not written
@@ -59,6 +58,7 @@ class Bundle:
         settings (`dict`): what preprocess.json says.
         reference (`dict`): what reference.npz holds: `input_<n>`, `output_<n>`, `adapter_scale_<n>` with a dial.
         license (`str`): a Hub license id, or `other`.
+        base: folder or hub id of the base.
     """
 
     out: Path
@@ -70,6 +70,7 @@ class Bundle:
     settings: dict[str, Any]
     reference: dict[str, np.ndarray]
     license: str
+    base: str | Path
 
     def write_settings(self, folder: Path) -> None:
         """preprocess.json, which a `Predictor` reads."""
@@ -111,8 +112,9 @@ def prepare_bundle(
     `own` are the files of `out` that may be replaced. Raises as `load_for_deployment` and `merged` do, and ValueError
     where `out` holds other files.
     """
-    out, base = Path(out), adapter_base(adapter) if base is None else base
-    check_new(out, own)
+    out = Path(out)
+    check_replaceable(out, own)
+    base, options["revision"] = find_base(base, adapter, options.get("revision"))
     model = load_for_deployment(adapter, base, adapter_scale, **options)
     settings = _settings(model, dial)
     multiple = settings["multiple_of"]
@@ -136,6 +138,7 @@ def prepare_bundle(
         settings=settings,
         reference=reference,
         license=license_of(adapter, base),
+        base=base,
     )
 
 

@@ -12,10 +12,11 @@ import torch
 import yaml
 from peft import PeftModel
 
-from gift_peft.adapters.folder import GIFT, processor_at_size, read_adapter_config, versions
+from gift_peft.adapters.folder import GIFT, processor_at_size, versions
 from gift_peft.adapters.recipes import RECIPES
 from gift_peft.deploy.stages import stages
 from gift_peft.files import is_hub_id, portable_name, reason, whole_folder, write_whole
+from gift_peft.models.adapter_base import find_base
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.model_card import base_license
 
@@ -23,19 +24,6 @@ TOLERANCE = 1e-7  # largest difference to the adapter in float64, relative to th
 SMALL = 84, 112  # pixels, for that comparison
 TEMPLATES = Path(__file__).parent / "templates"
 OWN = ("config.json", "preprocessor_config.json", "processor_config.json", "*.safetensors*", "README.md", GIFT, "*.py")
-
-
-def adapter_base(adapter: str | Path) -> str:
-    """The base that an adapter names.
-
-    Raises FileNotFoundError where it is not here, ValueError if the adapter names none.
-    """
-    base = read_adapter_config(adapter).base_model_name_or_path
-    if not base:
-        raise ValueError(f"adapter {adapter} names no base model: give --base")
-    if not Path(base).is_dir() and not is_hub_id(base):
-        raise FileNotFoundError(f"adapter {adapter} was trained on {base}, which is not here: give --base")
-    return base
 
 
 def load_for_deployment(
@@ -50,7 +38,7 @@ def load_for_deployment(
 
     Args:
         adapter: folder or hub id.
-        base (*optional*): default the one that the adapter names.
+        base (*optional*): default the one that the adapter names, sought beside the adapter too.
         adapter_scale (`float`): 0 is the base, 1 the adapter.
         revision, size, kind: as in `DepthModel.from_pretrained`.
 
@@ -58,9 +46,6 @@ def load_for_deployment(
         FileNotFoundError: no such adapter or base. ValueError: the adapter is of another base; a scale outside 0..1.
     """
     check_scale(adapter_scale)
-    base = adapter_base(adapter) if base is None else base
-    if revision is None and base == read_adapter_config(adapter).base_model_name_or_path:
-        revision = read_adapter_config(adapter).revision
     return DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device="cpu")
 
 
@@ -104,10 +89,10 @@ def deploy_transformers(adapter: str | Path, out: str | Path, base: str | Path |
 
     Args: as `load_for_deployment`. Raises as that and as `merged`, and ValueError if `out` holds other files.
     """
-    out, base = Path(out), adapter_base(adapter) if base is None else base
-    check_new(out, OWN)
-    with stages(3) as stage, whole_folder(out) as temporary:
+    out = Path(out)
+    with stages(3) as stage, whole_folder(out, OWN) as temporary:
         stage("the model")
+        base, options["revision"] = find_base(base, adapter, options.get("revision"))
         model = load_for_deployment(adapter, base, **options)
         stage("merging, and comparing with the adapter")
         model = merged(model)
@@ -119,21 +104,7 @@ def deploy_transformers(adapter: str | Path, out: str | Path, base: str | Path |
         facts = {"versions": versions(), "size": model.size, "kind": model.known_kind(), "adapter_scale": scale}
         write_whole(temporary / GIFT, json.dumps(facts, indent=2) + "\n")
         (temporary / "README.md").write_text(_card(model, adapter, base, scale), encoding="utf-8")
-        check_new(out, OWN)
     return out
-
-
-def check_new(folder: Path, own: tuple[str, ...]) -> None:
-    """ValueError if a folder that is to be written holds files that match none of the patterns `own`."""
-    if folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(f"{folder} is a file: name a folder")
-    others = (
-        [path.name for path in folder.iterdir() if not any(path.match(pattern) for pattern in own)]
-        if folder.exists()
-        else []
-    )
-    if others:
-        raise ValueError(f"{folder} holds other files ({', '.join(sorted(others)[:3])}): name a new folder")
 
 
 def license_of(adapter: str | Path, base: str | Path) -> str:

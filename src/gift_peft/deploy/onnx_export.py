@@ -22,7 +22,6 @@ from tqdm import tqdm
 
 from gift_peft.deploy.bundle import OWN, Bundle, prepare_bundle, write_bundle
 from gift_peft.deploy.dial import INPUT
-from gift_peft.deploy.merged import check_new
 from gift_peft.deploy.resampling import resampled_by_matrices
 from gift_peft.deploy.runtime import MODEL_ID
 from gift_peft.deploy.stages import stages
@@ -61,7 +60,7 @@ def _deploy(adapter: str | Path, out: str | Path, base: Any, int8: bool, **optio
     with stages(4 if int8 else 3) as stage:
         stage("the model")
         bundle = prepare_bundle(adapter, out, base, "int8" if int8 else "onnx", **options)
-        with whole_folder(bundle.out) as temporary:
+        with whole_folder(bundle.out, OWN) as temporary:
             stage("its graph, a minute for small and several for large models")
             write_onnx(bundle, temporary / "model.onnx")
             if int8:
@@ -70,7 +69,6 @@ def _deploy(adapter: str | Path, out: str | Path, base: Any, int8: bool, **optio
                 quantize(bundle, temporary)
             stage("comparison with torch")
             write_bundle(bundle, temporary, "onnx")
-            check_new(bundle.out, OWN)  # again: the export takes minutes
     return bundle.out
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from gift_peft.deploy.bundle import OWN, prepare_bundle, write_bundle
-from gift_peft.deploy.merged import check_new
 from gift_peft.deploy.onnx_export import require_onnx, write_onnx
 from gift_peft.deploy.runtime import MODEL_ID
 from gift_peft.deploy.stages import stages
@@ -28,7 +27,7 @@ def deploy_openvino(adapter: str | Path, out: str | Path, base: str | Path | Non
     with stages(4) as stage:
         stage("the model")
         bundle = prepare_bundle(adapter, out, base, "openvino", **options)
-        with whole_folder(bundle.out) as folder:
+        with whole_folder(bundle.out, OWN) as folder:
             stage("its graph, a minute for small and several for large models")
             with tempfile.TemporaryDirectory(dir=folder) as scratch:
                 write_onnx(bundle, Path(scratch) / "model.onnx")
@@ -42,5 +41,4 @@ def deploy_openvino(adapter: str | Path, out: str | Path, base: str | Path | Non
                 del model  # it reads its weights from the scratch folder
             stage("comparison with torch")
             write_bundle(bundle, folder, "openvino")
-            check_new(bundle.out, OWN)  # again: the export takes minutes
     return bundle.out

@@ -14,14 +14,13 @@ from PIL import Image
 from gift_peft.deploy import space_app
 from gift_peft.deploy.bundle import OWN as EXPORTED
 from gift_peft.deploy.bundle import Bundle, prepare_bundle, write_bundle
-from gift_peft.deploy.merged import adapter_base, check_new
 from gift_peft.deploy.onnx_export import require_onnx, write_onnx
 from gift_peft.deploy.stages import stages
 from gift_peft.files import is_hub_id, portable_name, whole_folder
 from gift_peft.images import list_images, read_image
 from gift_peft.options import package_version
 
-OWN = (*EXPORTED, "app.py", "requirements.txt", "about.json", "examples", ".gitattributes")
+OWN = (*EXPORTED, "app.py", "requirements.txt", "about.json", "examples/*", ".gitattributes")
 GRADIO = "6.31.0"  # what the page was tried with, where none is installed
 EXAMPLES = 3  # photos of the embedded groups, where none are given
 EXAMPLE_SIDE = 1280
@@ -50,13 +49,12 @@ def deploy_space(
     with stages(3) as stage:
         stage("the model")
         bundle = prepare_bundle(adapter, out, base, "space", own=OWN, dial=True, **options)
-        with whole_folder(bundle.out) as folder:
+        with whole_folder(bundle.out, OWN) as folder:
             stage("its graph, a minute for small and several for large models")
             write_onnx(bundle, folder / "model.onnx")
             stage("comparison with torch")
             write_bundle(bundle, folder, "onnx")
-            _write_page(bundle, folder, adapter, adapter_base(adapter) if base is None else base, photos)
-            check_new(bundle.out, OWN)
+            _write_page(bundle, folder, adapter, photos)
     return bundle.out
 
 
@@ -76,8 +74,8 @@ def _photos(examples: Sequence[str | Path]) -> dict[str, Image.Image]:
     return found
 
 
-def _write_page(bundle: Bundle, folder: Path, adapter: Any, base: Any, photos: dict[str, Image.Image]) -> None:
-    name = portable_name(base)
+def _write_page(bundle: Bundle, folder: Path, adapter: Any, photos: dict[str, Image.Image]) -> None:
+    name = portable_name(bundle.base)
     title = f"{name.split('/')[-1]} on mirrors and glass"
     text = (
         f"Depth from one photo: the base model {name} beside the same model with the GIFT adapter "
@@ -102,7 +100,7 @@ def _write_page(bundle: Bundle, folder: Path, adapter: Any, base: Any, photos: d
         "sdk_version": gradio,
         "app_file": "app.py",
         "license": bundle.license,
-        "models": [str(model) for model in (base, adapter) if is_hub_id(model) and "/" in str(model)],
+        "models": [str(model) for model in (bundle.base, adapter) if is_hub_id(model) and "/" in str(model)],
         "tags": ["depth-estimation", "gift", "transparent-objects", "mirrors"],
         "short_description": "Depth of mirrors and glass, before and after",
     }

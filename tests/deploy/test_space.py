@@ -123,7 +123,7 @@ def test_the_page_in_a_browser_without_a_network(space, tmp_path):
             page.on("pageerror", lambda error: failed.append(str(error)))
             page.goto(f"http://127.0.0.1:{port}", timeout=120_000)
             page.locator("#photo input[type=file]").set_input_files(str(next((space / "examples").iterdir())))
-            page.get_by_text("from the base on average").wait_for(timeout=120_000)
+            page.get_by_text("% from the base").wait_for(timeout=120_000)
             assert page.locator("#depths img").count() >= 2
             page.screenshot(path=tmp_path / "page.png", full_page=True)
             browser.close()

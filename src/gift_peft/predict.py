@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -54,6 +54,8 @@ def predict_images(
     focal_length: float | tuple[float, float] | None = None,
     device: "str | torch.device | None" = None,
     accept_base: bool = False,
+    deployed: str | Path | None = None,
+    backend: str | None = None,
     progress: bool = True,
 ) -> list[Path]:
     """Writes `<stem>.npy` and `<stem>.png` per picture and, with an adapter, `<stem>_base.npy/.png` beside them.
@@ -68,6 +70,8 @@ def predict_images(
         out: folder; made if missing. What an earlier `predict` left there under these names is replaced, nothing else.
         kind (`str`, *optional*): decides which end is bright; default the recipe's.
         focal_length (*optional*): of the camera in pixels, as in `DepthModel.depth_at`.
+        deployed (*optional*): a folder that `gift-peft deploy` exported, in place of base and adapter.
+        backend (`str`, *optional*): what computes a deployed model, `onnx` or `openvino`.
 
     Returns:
         `list[Path]`: the npy file of each picture.
@@ -78,14 +82,22 @@ def predict_images(
             unreadable pictures, non-finite predictions.
     """
     from gift_peft.colormap import color_range, colorize  # not for `--help`, which needs neither OpenCV nor torch
-    from gift_peft.models.loading import DepthModel
 
     files = list_images(images)
-    names = _unique_names(files, beside=adapter is not None)
+    model: Any = None
+    if deployed is not None:
+        from gift_peft.deploy.deployed import DeployedModel
+
+        model = DeployedModel(deployed, backend, adapter_scale)
+    beside = adapter is not None if model is None else model.adapted
+    names = _unique_names(files, beside)
     folder = Path(out)
-    stems = [stem for name in names for stem in ([name] if adapter is None else [name, f"{name}_base"])]
+    stems = [stem for name in names for stem in ([name, f"{name}_base"] if beside else [name])]
     _check_outputs(folder, stems, files)
-    model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
+    if model is None:
+        from gift_peft.models.loading import DepthModel
+
+        model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
     folder.mkdir(parents=True, exist_ok=True)
     mark = PngInfo()
     mark.add_text(*MARK)
@@ -95,7 +107,7 @@ def predict_images(
     ):
         try:
             depths = {name: model.depth_at(file, focal_length)}
-            if adapter is not None:
+            if beside:
                 depths[f"{name}_base"] = model.depth_at(file, focal_length, base=True)
         except ValueError as error:  # of this picture: the others are still wanted
             wrong.append(str(error))
@@ -166,6 +178,10 @@ def make_parser() -> OptionParser:
     add_adapter(parser)
     text = "of the camera that took the pictures, where the model takes one (Metric3D)"
     parser.add_argument("--focal-length", type=float, metavar="PIXELS", help=text)
+    text = "a folder of `gift-peft deploy --to onnx|openvino|int8`, in place of --base and --adapter"
+    parser.add_argument("--deployed", metavar="DIR", help=text)
+    text = "what computes a deployed model; default: what it was exported for"
+    parser.add_argument("--backend", choices=["onnx", "openvino"], help=text)
     parser.add_argument("--out", "--output-dir", required=True, metavar="DIR", help="folder for the npy and png files")
     return parser
 
@@ -173,8 +189,15 @@ def make_parser() -> OptionParser:
 def run(argv: Sequence[str]) -> int:
     parser = make_parser()
     args = parser.parse_args(argv)
-    if args.base is None and args.adapter is None:
-        parser.error("one of --base and --adapter is required")
+    if args.deployed is not None:
+        fixed = ("base", "adapter", "revision", "size", "kind")
+        given = [f"--{name}" for name in fixed if getattr(args, name) is not None]
+        if given:
+            parser.error(f"--deployed brings its own model: leave {', '.join(given)} out")
+    elif args.backend is not None:
+        parser.error("--backend computes a model named by --deployed")
+    elif args.base is None and args.adapter is None:
+        parser.error("one of --base, --adapter and --deployed is required")
     reasons: list[str] = []
     try:
         files = predict_images(
@@ -188,6 +211,8 @@ def run(argv: Sequence[str]) -> int:
             revision=args.revision,
             focal_length=args.focal_length,
             accept_base=args.accept_base,
+            deployed=args.deployed,
+            backend=args.backend,
         )
     except PicturesWithoutDepth as error:
         files, reasons = error.paths, error.reasons

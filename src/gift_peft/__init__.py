@@ -30,6 +30,8 @@ _HOME = {
     "depth_metrics": "evaluation.metrics",
     "evaluate_booster": "evaluation.evaluate",
     "evaluate_gift_i": "evaluation.evaluate",
+    "evaluate_layered_depth": "evaluation.layered_depth",
+    "evaluate_md3k": "evaluation.md3k",
     "geometry_consistency_error": "losses",
     "get_gift_model": "adapters.recipes",
     "gift_loss": "losses",

@@ -10,6 +10,8 @@ from gift_peft.dataset.gift_i import load_gift_i as load_gift_i
 from gift_peft.evaluation.alignment import align as align
 from gift_peft.evaluation.evaluate import evaluate_booster as evaluate_booster
 from gift_peft.evaluation.evaluate import evaluate_gift_i as evaluate_gift_i
+from gift_peft.evaluation.layered_depth import evaluate_layered_depth as evaluate_layered_depth
+from gift_peft.evaluation.md3k import evaluate_md3k as evaluate_md3k
 from gift_peft.evaluation.metrics import depth_metrics as depth_metrics
 from gift_peft.evaluation.protocols import PROTOCOLS as PROTOCOLS
 from gift_peft.group_step import GroupStep as GroupStep

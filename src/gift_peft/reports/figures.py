@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from gift_peft.colormap import color_range, colorize, colorize_error
 from gift_peft.evaluation.alignment import align, known
 from gift_peft.evaluation.metrics import depth_metrics
-from gift_peft.evaluation.protocols import get_protocol
+from gift_peft.evaluation.protocols import MILLIMETERS, get_protocol
 from gift_peft.files import write_whole
 from gift_peft.images import jpeg_uri
 
@@ -61,7 +61,7 @@ class Aligned:
 
     Args:
         errors (`tuple[float, float]`): RMSE inside the target, base and adapted; NaN where nothing is known there.
-        unit (`str`): ` mm`, or nothing for native units.
+        unit (`str`): ` mm` or ` cm`, or nothing for native units.
         kind (`str`): of all three maps, for the colours.
     """
 
@@ -85,14 +85,14 @@ class GridRow:
 def align_panel(panel: Panel) -> Aligned:
     """Both predictions aligned as the protocol says; ValueError if the arrays differ in size."""
     valid = np.ones(panel.reference.shape, bool) if panel.valid is None else panel.valid
-    base, adapted = (
-        align(prediction, panel.reference, valid, panel.protocol, panel.kind).aligned
-        for prediction in (panel.base, panel.adapted)
-    )
-    reference = np.where(valid & known(panel.reference), panel.reference, np.nan)
-    errors = tuple(depth_metrics(d, panel.reference, panel.target & valid)["rmse"] for d in (base, adapted))
-    native = get_protocol(panel.protocol).space == "native"
-    return Aligned(reference, base, adapted, errors, "" if native else " mm", panel.kind if native else "depth")
+    rules = get_protocol(panel.protocol)
+    truth, base, adapted = (depth / MILLIMETERS[rules.unit] for depth in (panel.reference, panel.base, panel.adapted))
+    base, adapted = (align(depth, truth, valid, rules, panel.kind).aligned for depth in (base, adapted))
+    reference = np.where(valid & known(truth), truth, np.nan)
+    errors = tuple(depth_metrics(d, truth, panel.target & valid)["rmse"] for d in (base, adapted))
+    native = rules.space == "native"
+    unit = "" if native else f" {rules.unit}"
+    return Aligned(reference, base, adapted, errors, unit, panel.kind if native else "depth")
 
 
 def before_after(

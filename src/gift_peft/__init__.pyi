@@ -24,6 +24,8 @@ from gift_peft.losses import self_distillation_loss as self_distillation_loss
 from gift_peft.models.loading import DepthModel as DepthModel
 from gift_peft.models.metric3d import Metric3DConfig as Metric3DConfig
 from gift_peft.models.metric3d import Metric3DForDepthEstimation as Metric3DForDepthEstimation
+from gift_peft.models.moge import MogeConfig as MogeConfig
+from gift_peft.models.moge import MogeForDepthEstimation as MogeForDepthEstimation
 from gift_peft.models.vggt import VggtConfig as VggtConfig
 from gift_peft.models.vggt import VggtForDepthEstimation as VggtForDepthEstimation
 from gift_peft.prepare.prepare import prepare_gift_i as prepare_gift_i

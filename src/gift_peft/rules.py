@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # torch takes longer to import than the command line takes to
 SPLITS = ("train", "validation")
 SURFACES = ["mirror", "transparent"]
 KINDS = ("depth", "inverse_depth")  # what a model predicts
+UNKNOWN = float(np.finfo(np.float32).min)  # a proxy where the teacher's own mask says that there is no surface
 
 
 @dataclass(frozen=True, eq=False)

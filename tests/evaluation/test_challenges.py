@@ -73,7 +73,7 @@ def test_protocols_name_what_they_rank_by():
     assert PROTOCOLS["ntire26"].ranked_by == "rmse" and not PROTOCOLS["ntire26"].fits_scale
     with pytest.raises(ValueError, match="thresholds"):
         Protocol("mine", space="depth", thresholds=(0.9,))
-    with pytest.raises(ValueError, match="ranked_by 'delta_1.05'; what is computed is mae"):
+    with pytest.raises(ValueError, match=r"ranked_by 'delta_1\.05'; what is computed is mae"):
         Protocol("mine", space="depth", ranked_by="delta_1.05")
     with pytest.raises(ValueError, match="unit 'inch'"):
         Protocol("mine", space="depth", unit="inch")

@@ -73,7 +73,8 @@ def read_layered_depth(root: str | Path, partial: bool = False) -> list[PhotoQue
         raise FileNotFoundError(f"LayeredDepth root {root}: no first layer; expected {LAYOUT} below it{_hint(root)}")
     if absent and not partial:
         raise FileNotFoundError(
-            f"LayeredDepth root {root}: {', '.join(absent)} is missing (partial=True, or --partial, evaluates the rest)"
+            f"LayeredDepth root {root}: {', '.join(absent)} is missing (partial=True, or --partial, evaluates the "
+            "rest)"
         )
     files: dict[str, dict[str, Path]] = {}
     for subset, folder in there.items():

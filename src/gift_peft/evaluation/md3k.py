@@ -24,8 +24,8 @@ LAYERS = {"sra1": "foreground_label", "sra2": "background_label"}
 LABELS = ("near", "far")  # point1 is nearer than point2, or farther
 SUBSETS = ("same", "reverse")
 NOTES = (
-    "MD-3k: SRA(1), SRA(2): share of pairs ordered as on the glass and as behind it; alpha = SRA(2) - SRA(1), positive "
-    "prefers what is behind; equal depths are wrong in both.",
+    "MD-3k: SRA(1), SRA(2): share of pairs ordered as on the glass and as behind it; alpha = SRA(2) - SRA(1), "
+    "positive prefers what is behind; equal depths are wrong in both.",
     "Schema: the one its authors suggest (Xu et al., ECCV 2026); the photos are GDD's, whose terms hold.",
 )
 
@@ -100,11 +100,8 @@ def _parse(pair: Any, where: str) -> tuple[np.ndarray, dict[str, str], str]:
     """((2, 2) points, {layer: label}, subset) of one annotation."""
     wanted = ("point1", "point2", *LAYERS.values(), "subset")
     if not isinstance(pair, dict) or not pair.keys() >= set(wanted):
-        legacy = (
-            " (a single `label` does not say which layer it means)"
-            if isinstance(pair, dict) and "label" in pair
-            else ""
-        )
+        is_legacy = isinstance(pair, dict) and "label" in pair
+        legacy = " (a single `label` does not say which layer it means)" if is_legacy else ""
         raise ValueError(f"{where}: {', '.join(wanted)} are expected{legacy}")
     try:
         points = np.asarray([pair["point1"], pair["point2"]], np.float64)

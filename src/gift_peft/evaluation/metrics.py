@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from gift_peft.evaluation.alignment import check_mask, check_shapes, known, like, to_numpy
-from gift_peft.evaluation.protocols import metric_names
+from gift_peft.evaluation.protocols import METRICS, metric_names
+
+__all__ = ["METRICS", "depth_metrics", "metric_names"]
 
 
 def depth_metrics(aligned: Any, reference: Any, region: Any, thresholds: Sequence[float] = ()) -> dict[str, Any]:
@@ -26,8 +28,8 @@ def depth_metrics(aligned: Any, reference: Any, region: Any, thresholds: Sequenc
         thresholds: factors of further deltas beside 1.25, such as (1.05, 1.10).
 
     Returns:
-        `dict`: `mae` and `rmse` in the reference's unit, `abs_rel`, `delta1` (and `delta_1.05`, ...) in percent; floats for (H,W), float64
-        (B,) arrays or tensors for (B,H,W).
+        `dict`: `mae` and `rmse` in the reference's unit, `abs_rel`, `delta1` (and `delta_1.05`, ...) in percent;
+        floats for (H,W), float64 (B,) arrays or tensors for (B,H,W).
 
     Raises:
         ValueError: disagreeing shapes, a region that is not bool, NaN or infinity in the region.

@@ -58,7 +58,7 @@ def question_name(key: str) -> str:
 
 
 def _values(report: OrderingReport, key: str) -> list[str | Cell]:
-    """Base, and where there is one the adapted model with its change; which way is better a preference does not say."""
+    """Base, and where there is one the adapted model with its change; no mark: a preference has no better side."""
     own = report.summary[key]
     if report.base is None:
         return [value_cell(own)]

@@ -92,7 +92,7 @@ def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Pat
     if not plots:
         return []
     names = list(dict.fromkeys(name for _, curves in plots for name, _, _ in curves))
-    pyplot = _import_pyplot()
+    pyplot = import_pyplot()
     figure, axes = pyplot.subplots(
         1, len(plots), figsize=(max(4.8, 3.6 * len(plots)), 3.2), squeeze=False, layout="constrained"
     )
@@ -125,7 +125,7 @@ def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Pat
     return names
 
 
-def _import_pyplot() -> Any:
+def import_pyplot() -> Any:
     """matplotlib.pyplot without a display; ImportError with the line that installs it."""
     try:
         import matplotlib

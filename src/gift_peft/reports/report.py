@@ -14,6 +14,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from gift_peft.adapters.folder import ADAPTER_WEIGHTS
+from gift_peft.evaluation.ordering_tables import TITLES, ordering_tables
 from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
@@ -24,6 +25,7 @@ from gift_peft.models.loading import DepthModel
 from gift_peft.reports.ablation import ablation_table, is_ablation
 from gift_peft.reports.compare import write_compare
 from gift_peft.reports.curves import draw_dynamics, draw_retention
+from gift_peft.reports.dial import draw_dial
 from gift_peft.reports.figures import Panel, before_after, error_maps
 from gift_peft.reports.model_card import model_card
 from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_names
@@ -121,6 +123,7 @@ def run_report(
     for run in saved:
         _evaluate_if_missing(run, output, device)
     _tables(saved, names, output)
+    _orderings(saved, names, output)
     _curves(saved, names, output)
     for run, name, own in zip(saved, names, folder_names(saved), strict=True):
         if panels:
@@ -156,7 +159,7 @@ def _is_of_adapter(run: SavedRun, report: Report) -> bool:
 
 
 def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> None:
-    if run.evaluations or run.adapter is None:
+    if run.evaluations or run.orderings or run.adapter is None:
         return
     from gift_peft.evaluation.verb import run_evaluation
 
@@ -211,6 +214,24 @@ def _dataset(report: Report) -> str:
 def _scaled(name: str, report: Report) -> str:
     scale = report.about.get("adapter_scale")
     return name if scale in (None, 1) else f"{name} (adapter scale {scale:g})"
+
+
+def _orderings(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> None:
+    """LayeredDepth and MD-3k of each run, with the layer dial's curve where it was turned."""
+    for run, name, own in zip(runs, names, folder_names(runs), strict=True):
+        for folder, report in run.orderings.items():
+            stem = f"{folder}-{own}" if len(runs) > 1 else folder
+            output.sections.append(f"## {TITLES[report.dataset]}: {name}\n")
+            for table, suffix in zip(ordering_tables(report), ("", "-dial"), strict=False):
+                output.table(f"{stem}{suffix}", table, show=True)
+            if not report.dial:
+                continue
+            try:
+                draw_dial(report, [output.folder / f"{stem}-dial{suffix}" for suffix in (".png", ".pdf")])
+            except ImportError as error:
+                output.remark(f"{stem}-dial.png: {reason(error)}")
+                continue
+            output.sections.append(f"![layer dial]({stem}-dial.png)\n")
 
 
 # ---- curves ----

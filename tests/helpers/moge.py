@@ -111,11 +111,20 @@ def _look_like_a_camera(network, name: str) -> None:
     network.mask_head.output_blocks[-1].bias.fill_(1.0)
 
 
-def tiny_moge(seed: int = 0, name: str = "v2-normal", **config):
-    """As a transformers model, in eval mode."""
+def tiny_moge(seed: int = 0, name: str = "v2-normal", sky: bool = False, **config):
+    """As a transformers model, in eval mode; with `sky` the mask of MoGe-2 leaves out the upper third."""
     from gift_peft.models.moge import MogeConfig, MogeForDepthEstimation
 
     network = tiny_network(name, seed)
+    if sky:
+        stack = network.mask_head
+        stack.resamplers[-1][1].weight.data[:2] *= 0.02
+        stack.input_blocks[-1].weight.data[:2] = 0
+        stack.input_blocks[-1].weight.data[1, 1] = 1  # v, which is negative above the center
+        stack.input_blocks[-1].bias.data[:2] = 0
+        stack.output_blocks[-1].weight.data *= 0.01
+        stack.output_blocks[-1].weight.data[0, 1] = 30
+        stack.output_blocks[-1].bias.data.fill_(4)
     official = {"model_config": copy.deepcopy(NETWORKS[name]), "model": network.state_dict()}
     return MogeForDepthEstimation.from_official(official, MogeConfig(network=NETWORKS[name], **config))
 

@@ -80,18 +80,16 @@ def test_depth_is_that_of_its_infer(name, tiny_vit, monkeypatch):
 
 
 def test_the_released_sizes_without_weights(tiny_vit):
-    # Published: 314 M, 326 M, 331 M, 104 M, 35 M.
-    millions = {}
+    published = dict(zip(VARIANTS, (314, 326, 331, 104, 35), strict=True))  # millions
     for name in VARIANTS:
         with torch.device("meta"):
             model = MogeForDepthEstimation(MogeConfig(variant=name))
-        millions[name] = round(sum(weight.numel() for weight in model.parameters()) / 1e6)
+        assert abs(sum(weight.numel() for weight in model.parameters()) / 1e6 - published[name]) < 1, name
         keys = set(model.state_dict())
         prefix = "network.backbone." if name == "moge-vitl" else "network.encoder.backbone."
         assert {f"{prefix}pos_embed", f"{prefix}blocks.11.attn.qkv.weight"} <= keys
         assert any(key.startswith("network.normal_head.") for key in keys) == name.endswith("normal")
         assert model.config.depth_estimation_type == ("affine" if name == "moge-vitl" else "metric")
-    assert list(millions.values()) == [314, 326, 331, 104, 35]
 
 
 # ---- the shift ----
@@ -127,7 +125,7 @@ def test_gradients_flow_through_the_shift():
     points = pinhole(5, 6, 8, 1)[0]
     points = (points + 0.05 * torch.randn(points.shape, generator=torch.Generator().manual_seed(0))).requires_grad_()
     mask = torch.rand(1, 6, 8, generator=torch.Generator().manual_seed(1)) < 0.8
-    assert torch.autograd.gradcheck(lambda p: recover_shift(p, mask)[1], points, rtol=1e-4, atol=1e-7)
+    assert torch.autograd.gradcheck(lambda p: recover_shift(p, mask)[1], points, rtol=1e-3, atol=1e-4)
 
 
 # ---- as a model of transformers ----
@@ -254,3 +252,31 @@ def test_a_missing_package_is_one_line_with_its_command(monkeypatch, tmp_path):
         DepthModel.from_pretrained(tmp_path)
     with pytest.raises(ValueError, match="dlr-moge"):
         convert_moge("Ruicheng/moge-2-vitl-normal", tmp_path / "new")
+
+
+@pytest.mark.parametrize("name", ["v1", "v2-normal"])
+def test_it_exports_to_onnx(name, tiny_vit, tmp_path):
+    pytest.importorskip("onnxscript", reason="onnxscript is not installed")
+    runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
+    model = tiny_moge(name=name)
+
+    class Depth(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.model = model
+
+        def forward(self, pixel_values):
+            return self.model(pixel_values=pixel_values).predicted_depth
+
+    for size in ((42, 56), (70, 98)):
+        pixels = images(1, 3, *size)
+        path = tmp_path / f"{size[0]}.onnx"
+        torch.onnx.export(
+            Depth().eval(), (pixels,), str(path), input_names=["pixel_values"], dynamo=True, verbose=False
+        )
+        session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        other = images(1, 3, *size, seed=5)
+        with torch.no_grad():
+            expected = model(other).predicted_depth
+        found = session.run(None, {"pixel_values": other.numpy()})[0]
+        np.testing.assert_allclose(found, expected.numpy(), rtol=2e-4, atol=2e-4)

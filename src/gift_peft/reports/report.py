@@ -25,7 +25,7 @@ from gift_peft.models.loading import DepthModel
 from gift_peft.reports.ablation import ablation_table, is_ablation
 from gift_peft.reports.compare import write_compare
 from gift_peft.reports.curves import draw_dynamics, draw_retention
-from gift_peft.reports.dial import draw_dial
+from gift_peft.reports.dial_curve import draw_dial
 from gift_peft.reports.figures import Panel, before_after, error_maps
 from gift_peft.reports.model_card import model_card
 from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_names

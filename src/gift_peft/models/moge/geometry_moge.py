@@ -43,54 +43,45 @@ def recover_shift(points: Tensor, valid: Tensor | None = None) -> tuple[Tensor, 
         weight = torch.ones_like(sampled[:, 0])
     else:
         weight = F.interpolate(valid[:, None].double(), SAMPLE, mode="nearest").flatten(1)
-    xy, z = sampled[:, :2], sampled[:, 2]
-    start, low, high, inside = _search(xy.detach(), z.detach(), uv, weight)
-    shift = start
+    xy, z = sampled[:, :2], torch.where(weight > 0, sampled[:, 2], 1.0)
+    # With r = 1 / (z + shift), what f explains is N^2 / D, of N = sum(along r) and D = sum(square r^2).
+    along, square = weight * (xy * uv).sum(1), weight * xy.square().sum(1)
+    fixed = z.detach(), along.detach(), square.detach()
+    shift, low, high, inside = _search(*fixed, weight)
     for _ in range(NEWTON_STEPS):
-        slope, curvature, _ = _stationarity(xy.detach(), z.detach(), uv, weight, shift)
-        step = torch.where(curvature != 0, slope / curvature, torch.zeros_like(slope))
+        slope, curvature, _ = _stationarity(*fixed, shift)
+        step = torch.where(curvature != 0, slope / torch.where(curvature != 0, curvature, 1.0), 0.0)
         shift = torch.minimum(torch.maximum(shift - step, low), high)
-    slope, curvature, focal = _stationarity(xy, z, uv, weight, shift)
+    slope, curvature, focal = _stationarity(z, along, square, shift)
     # The value is the shift; its derivative is that of one more Newton step, which at the solution is exact.
-    curvature = torch.where(inside & (curvature != 0), curvature.detach(), torch.full_like(curvature, torch.inf))
+    curvature = torch.where(inside & (curvature != 0), curvature.detach(), torch.inf)
     shift = shift - (slope - slope.detach()) / curvature
     enough = weight.sum(1) >= 2
     return torch.where(enough, focal.detach(), 1.0), torch.where(enough, shift, 0.0)
 
 
-def _search(xy: Tensor, z: Tensor, uv: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _search(z: Tensor, along: Tensor, square: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(B,) best shift on a logarithmic grid that keeps all points in front, its neighbors, and whether both exist."""
     scale = (weight * z.abs()).sum(1) / weight.sum(1).clamp(min=1)
     nearest = torch.where(weight > 0, z, torch.inf).amin(1)
     nearest = torch.where(nearest.isfinite(), nearest, 0.0)
     grid = torch.linspace(math.log(NEAREST), math.log(FARTHEST), CANDIDATES, dtype=z.dtype, device=z.device).exp()
     shifts = scale.clamp(min=torch.finfo(torch.float32).tiny)[:, None] * grid - nearest[:, None]  # (B,C)
-    fits = torch.stack([_fit(xy, z, uv, weight, shifts[:, index]) for index in range(CANDIDATES)], dim=1)
-    best = fits.argmax(1, keepdim=True)
+    inverse = _inverse(z[:, None] + shifts[..., None])
+    n, d = (along[:, None] * inverse).sum(-1), (square[:, None] * inverse.square()).sum(-1)
+    best = torch.where(d > 0, n.square() / torch.where(d > 0, d, 1.0), 0.0).argmax(1, keepdim=True)
     around = [shifts.gather(1, (best + turn).clamp(0, CANDIDATES - 1))[:, 0] for turn in (0, -1, 1)]
-    return *around, ((best > 0) & (best < CANDIDATES - 1))[:, 0]
+    return around[0], around[1], around[2], ((best > 0) & (best < CANDIDATES - 1))[:, 0]
 
 
-def _sums(xy: Tensor, z: Tensor, uv: Tensor, weight: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """1 / (z + shift), and per point the weighted q.u and q.q of its projection q."""
-    depth = z + shift[:, None]
-    inverse = torch.where(weight > 0, 1 / torch.where(depth == 0, torch.ones_like(depth), depth), 0.0)
-    projected = xy * inverse[:, None]
-    return inverse, weight * (projected * uv).sum(1), weight * projected.square().sum(1)
+def _inverse(depth: Tensor) -> Tensor:
+    return 1 / torch.where(depth == 0, 1.0, depth)
 
 
-def _fit(xy: Tensor, z: Tensor, uv: Tensor, weight: Tensor, shift: Tensor) -> Tensor:
-    """(B,) what a shift explains of the picture: the squared error is a constant minus this."""
-    _, along, square = _sums(xy, z, uv, weight, shift)
-    total = square.sum(1)
-    return torch.where(total > 0, along.sum(1).square() / total.clamp(min=torch.finfo(total.dtype).tiny), 0.0)
-
-
-def _stationarity(xy: Tensor, z: Tensor, uv: Tensor, weight: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(B,) of N^2 / D, with N = sum q.u and D = sum q.q: what is 0 at its extremum, the derivative of that, N / D."""
-    inverse, along, square = _sums(xy, z, uv, weight, shift)
-    n, d = along.sum(1), square.sum(1)
-    n1, n2 = -(along * inverse).sum(1), 2 * (along * inverse.square()).sum(1)
-    d1, d2 = -2 * (square * inverse).sum(1), 6 * (square * inverse.square()).sum(1)
+def _stationarity(z: Tensor, along: Tensor, square: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(B,) what is 0 where N^2 / D is extremal over the shift, the derivative of that, and N / D, the focal length."""
+    r = _inverse(z + shift[:, None])
+    n, n1, n2 = (along * r).sum(1), -(along * r**2).sum(1), 2 * (along * r**3).sum(1)
+    d, d1, d2 = (square * r**2).sum(1), -2 * (square * r**3).sum(1), 6 * (square * r**4).sum(1)
     slope, curvature = 2 * n1 * d - n * d1, 2 * n2 * d + n1 * d1 - n * d2
-    return slope, curvature, torch.where(d > 0, n / d.clamp(min=torch.finfo(d.dtype).tiny), 1.0)
+    return slope, curvature, torch.where(d > 0, n / torch.where(d > 0, d, 1.0), 1.0)

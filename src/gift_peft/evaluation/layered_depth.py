@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from gift_peft.evaluation.orderings import OrderingReport, PhotoQuestions, evaluate_orderings
 from gift_peft.files import reason
@@ -53,7 +54,7 @@ def evaluate_layered_depth(
         FileNotFoundError: no such tree, a folder, photo or prediction that is missing.
         ValueError: a damaged line, naming file and line, and as `evaluate_booster`.
     """
-    photos = read_layered_depth(root, partial)
+    photos = read_layered_depth(root, partial, options.get("progress", True))
     report = evaluate_orderings(
         "layereddepth", photos, model, predictions, kind, derive=dict, notes=NOTES, dial=dial, **options
     )
@@ -61,8 +62,15 @@ def evaluate_layered_depth(
     return report
 
 
-def read_layered_depth(root: str | Path, partial: bool = False) -> list[PhotoQuestions]:
+def read_layered_depth(root: str | Path, partial: bool = False, progress: bool = True) -> list[PhotoQuestions]:
     """The photos of a tree that have tuples, in natural order."""
+    files, pictures = find_layered_depth(root, partial)
+    ordered = tqdm(sorted(files, key=natural_key), "read", unit="photo", delay=2, disable=None if progress else True)
+    return [PhotoQuestions(pictures[i].name, pictures[i], _read_questions(files[i])) for i in ordered]
+
+
+def find_layered_depth(root: str | Path, partial: bool = False) -> tuple[dict[str, dict[str, Path]], dict[str, Path]]:
+    """({index: {subset: file of tuples}}, {index: photo}) of a tree; raises as `evaluate_layered_depth`."""
     root = Path(root)
     if not root.is_dir():
         raise FileNotFoundError(f"LayeredDepth root {root}: no such folder")
@@ -82,11 +90,7 @@ def read_layered_depth(root: str | Path, partial: bool = False) -> list[PhotoQue
             files.setdefault(path.stem, {})[subset] = path
     if not files:
         raise FileNotFoundError(f"LayeredDepth root {root}: no .jsonl files; expected {LAYOUT} below it")
-    pictures = _pictures(root, files)
-    return [
-        PhotoQuestions(pictures[index].name, pictures[index], _read_questions(files[index]))
-        for index in sorted(files, key=natural_key)
-    ]
+    return files, _pictures(root, files)
 
 
 def _hint(root: Path) -> str:

@@ -6,7 +6,7 @@ is right / all over the questions of all photos. `layered_depth` and `md3k` besi
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -153,18 +153,14 @@ def evaluate_orderings(
     missing = [photo.path for photo in photos if not photo.path.is_file()]
     if missing:
         raise FileNotFoundError(f"{len(missing)} photos are missing, the first is {missing[0]}")
-    predictors: dict[str, Callable[[PhotoQuestions], Any]]
+    depth_model = None
     if predictions is not None:
         if kind is None:
             raise ValueError('say what the predictions are: kind="depth" or kind="inverse_depth"')
-        predictors = {"base": _stored(Path(predictions), photos)}
-        depth_model = None
+        predictors: Predictors = {"base": _stored(Path(predictions), photos)}
     else:
         depth_model = DepthModel.of(model, teacher=teacher, processor=processor, size=size, kind=kind)
-        kind = depth_model.known_kind()
-        predictors = {"base": lambda photo: depth_model.depth_at(photo.path, base=True)}
-        if depth_model.adapted:
-            predictors["adapted"] = lambda photo: depth_model.depth_at(photo.path)
+        kind, predictors = depth_model.known_kind(), _predictors(depth_model)
     if dial and (depth_model is None or not hasattr(depth_model.network, "disable_adapter")):
         raise ValueError("the layer dial turns an adapter: name one")
     rows = _answers(photos, predictors, kind, progress, "evaluate")
@@ -194,6 +190,12 @@ def evaluate_orderings(
         rows=rows,
         about={"kind": kind, "predictions": predictions and str(predictions)},
     )
+
+
+def _predictors(model: DepthModel) -> Predictors:
+    """Base and, where there is an adapter or a teacher, adapted, each as `gift-peft predict` writes it."""
+    base = {"base": lambda photo: model.depth_at(photo.path, base=True)}
+    return base | ({"adapted": lambda photo: model.depth_at(photo.path)} if model.adapted else {})
 
 
 def _stored(folder: Path, photos: Sequence[PhotoQuestions]) -> Callable[[PhotoQuestions], np.ndarray]:
@@ -243,7 +245,7 @@ def _accuracy(rows: list[dict], model: str, subset: str) -> float:
 
 def _turn(
     photos: Sequence[PhotoQuestions], model: Any, kind: str, scales: Sequence[float], progress: bool
-) -> Iterable[tuple[float, list[dict]]]:
+) -> Iterator[tuple[float, list[dict]]]:
     """(scale, rows) of the adapter at each scale; afterwards it has scale 1 again, or the one that was asked for."""
     from gift_peft.adapters.scale import adapter_scale, set_adapter_scale
 

@@ -6,7 +6,7 @@ pictures come one at a time, so that a scene of 12 megapixels takes the memory o
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,7 @@ def gift_i_sample(
     group = row if isinstance(row, Group) else collate_group(row, model.processor, model.size)
     if group.target is None and model.masks_itself and reference == "proxy":
         known = model.predict_proxies(group.pixel_values) != UNKNOWN
-        group.valid = known if group.valid is None else group.valid & known
+        group = replace(group, valid=known if group.valid is None else group.valid & known)
     maps = _predict(predictors, group.pixel_values, f"group {group.group_id}", group.names)
     for name, prediction in maps.items():
         if prediction.shape != group.mask.shape:

@@ -104,14 +104,14 @@ def run_orderings(
 
     `name` is `layereddepth` or `md3k`; `options` are further arguments of its evaluator.
     """
-    from gift_peft.evaluation.layered_depth import evaluate_layered_depth, read_layered_depth
+    from gift_peft.evaluation.layered_depth import evaluate_layered_depth, find_layered_depth
     from gift_peft.evaluation.md3k import evaluate_md3k, read_md3k
     from gift_peft.evaluation.ordering_tables import ordering_markdown, ordering_text
     from gift_peft.models.loading import DepthModel
 
     evaluate = {"layereddepth": evaluate_layered_depth, "md3k": evaluate_md3k}[name]
     if base is not None:  # fail early: large weights take minutes to load
-        read_md3k(root) if name == "md3k" else read_layered_depth(root, options.get("partial", False))
+        read_md3k(root) if name == "md3k" else find_layered_depth(root, options.get("partial", False))
     model = (
         None
         if base is None

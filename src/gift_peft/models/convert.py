@@ -64,9 +64,8 @@ def convert_moge(
     _check_free(Path(folder))
     import_moge("v2")  # before a download of a gigabyte
     source = _fetch(source, MOGE_FILE, folder)
-    return _convert(
-        MogeForDepthEstimation, MogeImageProcessorPil(), source, folder, config, {"num_tokens": num_tokens}
-    )
+    settings = {} if num_tokens is None else {"num_tokens": num_tokens}
+    return _convert(MogeForDepthEstimation, MogeImageProcessorPil(), source, folder, config, settings)
 
 
 CONVERTERS = {"vggt": convert_vggt, "metric3d": convert_metric3d, "moge": convert_moge}

@@ -57,8 +57,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 class MogeConfig(PreTrainedConfig):
     r"""
     Args:
-        variant (`str`, *optional*, defaults to `"moge-2-vitl-normal"`): the released model whose sizes `network` has
-            where it is not given.
+        variant (`str`, *optional*): the released model whose sizes `network` has where it is not given; default
+            `"moge-2-vitl-normal"`.
         network (`dict`, *optional*): arguments of the package's `MoGeModel`, which a checkpoint has as `model_config`;
             in its first version `encoder` is a name, in the second a dict.
         num_tokens (`int`, *optional*): patches of a picture at the vision transformer, whatever the picture's size;
@@ -67,12 +67,13 @@ class MogeConfig(PreTrainedConfig):
 
     model_type = "gift_moge"
 
-    variant: str = "moge-2-vitl-normal"
+    variant: str | None = None
     network: dict | None = None
     num_tokens: int | None = None
 
     def __post_init__(self, **kwargs):
         if self.network is None:
+            self.variant = self.variant or "moge-2-vitl-normal"
             if self.variant not in VARIANTS:
                 raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {self.variant!r}")
             self.network = VARIANTS[self.variant]

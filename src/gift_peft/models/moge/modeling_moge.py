@@ -123,7 +123,8 @@ class MogeForDepthEstimation(PreTrainedModel):
             raise ValueError(f"pixel_values must be (B, 3, H, W), got {shape}")
         if not pixel_values.is_floating_point():
             raise ValueError(f"pixel_values must be floats from 0 to 1, got {pixel_values.dtype}")
-        tokens = num_tokens or self.config.num_tokens or int(self.network.num_tokens_range[1])
+        most = int(self.network.num_tokens_range[1])
+        tokens = next(count for count in (num_tokens, self.config.num_tokens, most) if count is not None)
         if tokens < 1:
             raise ValueError(f"num_tokens must be positive, got {tokens}")
         output = self.network.forward(pixel_values, num_tokens=tokens)

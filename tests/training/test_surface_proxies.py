@@ -53,7 +53,7 @@ def expected_target(model, row, settings, flip, kind="inverse_depth"):
     ]
     small = np.stack([resize_mask(mask, SIZE)[:, turn] for mask in masks])
     own = predict(row["images"])
-    found = surface_target(own.numpy(), small, fills=torch.stack(fills).numpy(), kind=kind)
+    found = surface_target(own.numpy(), small, fills=torch.stack(fills).numpy(), kind=kind, quantile=0.65, tau=0.5)
     return own, torch.from_numpy(small), torch.from_numpy(found.depth).float()
 
 
@@ -74,7 +74,7 @@ def test_targets_are_the_rule_on_the_teachers_predictions(tmp_path, raw_tree, ki
     header = read_header(folder / "train/scene_1.surface.safetensors")
     assert header["format"] == "gift-peft surface targets 1" and header["rule"] == "surface 1"
     assert (header["fills"], header["seed"], header["surface_model"]) == (2, 3, "auto")
-    assert (header["surface_quantile"], header["surface_tau"], header["size"]) == (0.8, 0.7, "56x70")
+    assert (header["surface_quantile"], header["surface_tau"], header["size"]) == (0.65, 0.5, "56x70")
     assert len(header["images"]) == len(header["masks"]) == 3
     assert header["kind"] == ("depth" if kind == "metric" else "inverse_depth")
 

@@ -172,9 +172,11 @@ def proxies_command(
     }
     if surface is not None:
         options["--target"] = "surface"
+        defaults = SurfaceSettings(surface.fills)
         for field in fields(surface):
             value = getattr(surface, field.name)
-            options[f"--{field.name}"] = None if value == field.default else value
+            default = field.default if field.name == "fills" else getattr(defaults, field.name)
+            options[f"--{field.name}"] = None if value == default else value
     given = [part for option, value in options.items() if value is not None for part in (option, str(value))]
     return shlex.join(["gift-peft", "proxies", *given])
 

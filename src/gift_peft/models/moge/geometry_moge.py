@@ -13,7 +13,6 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 SAMPLE = (64, 64)  # points of a picture, as in the package
 NEAREST, FARTHEST, CANDIDATES = 1e-3, 1e3, 96  # of the smallest z + shift, in mean |z|
@@ -36,16 +35,12 @@ def recover_shift(points: Tensor, valid: Tensor | None = None) -> tuple[Tensor, 
     Args: `points` (B,H,W,3) float; `valid` (B,H,W) bool, the points that count, default all.
     """
     height, width = points.shape[1:3]
-    sampled = F.interpolate(points.permute(0, 3, 1, 2), SAMPLE, mode="nearest").flatten(2).double()
-    plane = view_plane(height, width, points.device).permute(2, 0, 1)[None]
-    uv = F.interpolate(plane, SAMPLE, mode="nearest").flatten(2)  # (1,2,K)
-    if valid is None:
-        weight = torch.ones_like(sampled[:, 0])
-    else:
-        weight = F.interpolate(valid[:, None].double(), SAMPLE, mode="nearest").flatten(1)
-    xy, z = sampled[:, :2], torch.where(weight > 0, sampled[:, 2], 1.0)
+    sampled = _sample(points).double()  # (B,K,3)
+    uv = _sample(view_plane(height, width, points.device)[None])  # (1,K,2)
+    weight = torch.ones_like(sampled[..., 0]) if valid is None else _sample(valid[..., None])[..., 0].double()
+    xy, z = sampled[..., :2], torch.where(weight > 0, sampled[..., 2], 1.0)
     # With r = 1 / (z + shift), what f explains is N^2 / D, of N = sum(along r) and D = sum(square r^2).
-    along, square = weight * (xy * uv).sum(1), weight * xy.square().sum(1)
+    along, square = weight * (xy * uv).sum(-1), weight * xy.square().sum(-1)
     fixed = z.detach(), along.detach(), square.detach()
     shift, low, high, inside = _search(*fixed, weight)
     for _ in range(NEWTON_STEPS):
@@ -58,6 +53,16 @@ def recover_shift(points: Tensor, valid: Tensor | None = None) -> tuple[Tensor, 
     shift = shift - (slope - slope.detach()) / curvature
     enough = weight.sum(1) >= 2
     return torch.where(enough, focal.detach(), 1.0), torch.where(enough, shift, 0.0)
+
+
+def _sample(values: Tensor) -> Tensor:
+    """(B,K,C) of (B,H,W,C): the pixels that nearest interpolation takes; by index, which runtimes do in any type."""
+    height, width = values.shape[1:3]
+    rows, columns = (
+        (torch.arange(count, dtype=torch.float32, device=values.device) * (side / count)).long().clamp(max=side - 1)
+        for count, side in zip(SAMPLE, (height, width), strict=True)
+    )
+    return values[:, rows][:, :, columns].flatten(1, 2)
 
 
 def _search(z: Tensor, along: Tensor, square: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -14,6 +14,7 @@ import torch
 import yaml
 from helpers.booster_tree import write_root
 from helpers.demo_folder import write_demo
+from helpers.orderings import write_layered, write_md3k
 from helpers.tiny import SIZE, write_raw_tree
 
 from gift_peft.captures.foreign import read_layout
@@ -68,7 +69,7 @@ def only_parsed(command: str) -> bool:
 
 @pytest.fixture
 def workspace(tmp_path, monkeypatch):
-    """A folder as after `gift-peft demo`, with photos and captures of one's own, and a Booster."""
+    """A folder as after `gift-peft demo`, with photos and captures of one's own, and the benchmarks."""
     with pytest.warns(UserWarning, match="the base is the local folder"):
         write_demo(tmp_path / "demo")
     write_raw_tree(tmp_path / "my-captures")
@@ -78,6 +79,8 @@ def workspace(tmp_path, monkeypatch):
     (tmp_path / "photos" / "masks").rmdir()
     (tmp_path / "photo.jpg").write_bytes((tmp_path / "photos" / "0.png").read_bytes())
     write_root(tmp_path / "booster", scenes=1)
+    write_layered(tmp_path / "layered-depth")
+    write_md3k(tmp_path / "md3k")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

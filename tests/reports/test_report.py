@@ -22,7 +22,8 @@ from gift_peft import cli
 from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.verb import run_evaluation
 from gift_peft.reports.ablation import ablation_table, is_ablation
-from gift_peft.reports.report import notable_observations, run_report
+from gift_peft.reports.chosen import notable_observations
+from gift_peft.reports.report import run_report
 from gift_peft.reports.saved_run import SavedRun, read_run, run_names
 from gift_peft.reports.zero_shot import checkpoint_folders
 from gift_peft.training import train

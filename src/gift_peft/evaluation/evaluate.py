@@ -23,8 +23,8 @@ from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.alignment import align, known, resize_prediction
 from gift_peft.evaluation.booster_scenes import TOM_CLASSES, BoosterScene, GroundTruth, find_booster, read_ground_truth
 from gift_peft.evaluation.fitting import DegenerateFitError
-from gift_peft.evaluation.metrics import METRICS, depth_metrics
-from gift_peft.evaluation.protocols import Protocol, get_protocol
+from gift_peft.evaluation.metrics import depth_metrics, metric_names
+from gift_peft.evaluation.protocols import MILLIMETERS, Protocol, get_protocol
 from gift_peft.evaluation.results import REGIONS, Report, make_report
 from gift_peft.evaluation.samples import (
     Observation,
@@ -321,6 +321,9 @@ class Scorer:
         mask = observation.mask
         valid = np.ones(mask.shape, bool) if observation.valid is None else observation.valid
         there = np.zeros(mask.shape, bool) if self.reference is None else valid & known(self.reference)
+        self.unit = MILLIMETERS[task.protocol.unit]
+        if self.reference is not None and self.unit != 1:
+            self.reference = self.reference / self.unit
         self.regions = {"all": there, "tom": there & mask, "other": there & ~mask}
         self.pixels = {name: int(np.count_nonzero(self.regions[name])) for name in REGIONS}
         self.target_pixels = int(np.count_nonzero(mask & valid))
@@ -329,19 +332,20 @@ class Scorer:
         """Scores of a (h,w) prediction of any size; NaN and the reason where there is nothing to compare."""
         task = self.task
         nothing = {"scale": float("nan"), "shift": float("nan"), "num_clipped": 0, "num_nonpositive": 0}
-        nothing |= {region: dict.fromkeys(METRICS, float("nan")) for region in REGIONS}
+        thresholds = task.protocol.thresholds
+        nothing |= {region: dict.fromkeys(metric_names(thresholds), float("nan")) for region in REGIONS}
         if self.reference is None or self.pixels["all"] < 2:
             return nothing, task.missing
         prediction = resize_prediction(prediction, self.reference.shape)
-        if task.prediction_scale != 1:
-            prediction = prediction * task.prediction_scale
+        if (scale := task.prediction_scale / self.unit) != 1:
+            prediction = prediction * scale
         try:
             alignment = align(prediction, self.reference, self.regions["all"], task.protocol, task.kind)
         except DegenerateFitError:
             return nothing, "with a constant {model} prediction"
         scores = {name: getattr(alignment, name) for name in ("scale", "shift", "num_clipped", "num_nonpositive")}
         for name in REGIONS:
-            scores[name] = depth_metrics(alignment.aligned, self.reference, self.regions[name])
+            scores[name] = depth_metrics(alignment.aligned, self.reference, self.regions[name], thresholds)
         return scores, None
 
 

@@ -140,7 +140,7 @@ def make_report(
         protocol=protocol.to_dict() | {"description": protocol.describe()},
         reference=reference,
         adapted=subject == "adapted",
-        unit="native units" if reference == "proxy" else "mm",
+        unit="native units" if reference == "proxy" else "cm" if protocol.unit == "cm" else "mm",
         groups=groups,
         rows=rows,
         dataset=dataset,
@@ -164,9 +164,10 @@ def mean(values: list[float]) -> float:
 
 
 def summarize(rows: list[dict], model: str) -> dict:
-    """{region: {metric: mean over images}} of one of `base`, `adapted`, `consensus`."""
+    """{region: {metric: mean over images}} of one of `base`, `adapted`, `consensus`, with the metrics of the rows."""
+    metrics = rows[0][model]["all"] if rows else METRICS
     return {
-        region: {metric: mean([row[model][region][metric] for row in rows]) for metric in METRICS}
+        region: {metric: mean([row[model][region][metric] for row in rows]) for metric in metrics}
         for region in REGIONS
     }
 

@@ -26,7 +26,7 @@ from gift_peft.images import read_image
 from gift_peft.models.adapter_base import check_base, find_base
 from gift_peft.models.identity import adapter_as_base, check_base_name
 from gift_peft.models.pixels import resolve_size, to_pixel_values
-from gift_peft.rules import KINDS
+from gift_peft.rules import KINDS, UNKNOWN
 
 # Depth Pro's post-processing turns inverse depth into depth, and ZoeDepth's needs torchvision: native units are kept.
 RESIZED_HERE = {"zoedepth", "depth_pro"}
@@ -172,6 +172,11 @@ class DepthModel:
             raise ValueError("the model does not say where it came from; pass its processor=")
         return load_processor(source)
 
+    @property
+    def masks_itself(self) -> bool:
+        """Whether the network says where there is no surface."""
+        return getattr(getattr(self.network, "config", None), "predicts_valid_mask", False)
+
     def known_kind(self) -> str:
         """`kind`; ValueError where nothing says it."""
         if self.kind is None:
@@ -192,6 +197,13 @@ class DepthModel:
     def predict_base(self, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
         """`predict` of the base alone: with the adapter off, or by the teacher."""
         return self._predict(pixel_values, batch_size, base=True)
+
+    def predict_proxies(self, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
+        """`predict_base`, with `rules.UNKNOWN` where the network's own mask says that there is no surface (sky).
+
+        For a network without such a mask (an output `valid_mask`) the same as `predict_base`.
+        """
+        return self._predict(pixel_values, batch_size, base=True, masked=True)
 
     def depth_at(
         self,
@@ -242,9 +254,14 @@ class DepthModel:
             depth = post_process(output, target_sizes=[size], **options)[0]["predicted_depth"]
         return depth.float().cpu().numpy().reshape(size)  # transformers squeezes a side of one pixel away
 
-    def _predict(self, pixel_values: torch.Tensor, batch_size: int, base: bool) -> torch.Tensor:
-        outputs = (self._forward(batch, base) for batch in pixel_values.split(batch_size))
-        return torch.cat([getattr(output, "predicted_depth", output).float().cpu() for output in outputs])
+    def _predict(self, pixel_values: torch.Tensor, batch_size: int, base: bool, masked: bool = False) -> torch.Tensor:
+        depths = []
+        for batch in pixel_values.split(batch_size):
+            output = self._forward(batch, base)
+            depth = getattr(output, "predicted_depth", output).float()
+            valid = getattr(output, "valid_mask", None) if masked else None
+            depths.append((depth if valid is None else depth.masked_fill(~valid, UNKNOWN)).cpu())
+        return torch.cat(depths)
 
     def _forward(self, pixel_values: torch.Tensor, base: bool) -> Any:
         if base and self._teacher is not None:

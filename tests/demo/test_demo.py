@@ -100,6 +100,46 @@ def test_the_demo_is_channels_last_where_it_can_and_may_be(embedded, tmp_path, m
     assert asked[0].channels_last is channels_last
 
 
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("theirs", "said"),
+    [
+        ("base/model.safetensors", "base holds files"),
+        ("gift-i/train/hall/0.png", "gift-i holds files"),
+        ("report.md", "has report.md"),
+        ("evaluation-depth/notes.txt", "has evaluation-depth"),
+        ("config.yaml", "has config.yaml"),
+    ],
+)
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_the_demo_keeps_what_no_demo_wrote(theirs, said, overwrite, embedded, tmp_path):
+    out = tmp_path / "demo"
+    (out / theirs).parent.mkdir(parents=True)
+    (out / theirs).write_text("mine: 1\n")
+    with pytest.raises(ValueError, match=said):
+        run.run_demo(out, overwrite_output_dir=overwrite)
+    assert (out / theirs).read_text() == "mine: 1\n"
+
+
+def test_a_demo_again_replaces_its_own_and_nothing_added(embedded, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run._copy_embedded("base", Path("demo/base"), earlier=False)  # as a demo that was killed here
+    run._copy_embedded("base", Path("demo/base"), earlier=False)
+    (tmp_path / "demo/base/notes.txt").write_text("mine")
+    before = contents(tmp_path / "demo/base")
+    run._copy_embedded("base", Path("demo/base"), earlier=True)
+    assert contents(tmp_path / "demo/base") == before  # the same base: nothing to do
+    write_base(embedded / "base", seed=5)  # that of another version
+    with pytest.raises(ValueError, match=r"base holds files .*notes\.txt"):
+        run._copy_embedded("base", Path("demo/base"), earlier=True)
+    (tmp_path / "demo/base/notes.txt").unlink()
+    run._copy_embedded("base", Path("demo/base"), earlier=True)
+    assert contents(tmp_path / "demo/base") == contents(embedded / "base") != before
+
+
 @pytest.mark.parametrize("argument", ["--output_dir=x", "--dataset_name=mine", "--model_name_or_path=x/base"])
 def test_what_the_demo_brings_itself_is_not_replaced(embedded, tmp_path, argument):
     name = argument[2:].split("=")[0]

@@ -69,7 +69,7 @@ def lambda_model(model):
 
 def test_proxies_are_the_models_predictions(raw_tree, base_dir, model):
     folder = make_proxies(base_dir, raw_tree, size=SIZE)
-    assert folder == raw_tree / "proxies" / teacher_id(base_dir)
+    assert folder == raw_tree / "proxies" / teacher_id(base_dir) / "56x70"
     assert list(files(folder)) == [f"{group}.safetensors" for group in GROUPS]
     for split in ("train", "validation"):
         for row in load_gift_i(raw_tree, split, teacher=base_dir, size=SIZE):
@@ -102,7 +102,7 @@ def test_first_distillation_is_exactly_zero(raw_tree, base_dir, model):
 def test_rows_with_proxies_behave_as_a_dataset(raw_tree, base_dir, tmp_path):
     make_proxies(base_dir, raw_tree, size=SIZE, proxies_dir=tmp_path / "elsewhere")
     rows = load_gift_i(raw_tree, "train", teacher=base_dir, proxies_dir=tmp_path / "elsewhere")
-    (tmp_path / "elsewhere" / teacher_id(base_dir) / "train/scene_1.safetensors").unlink()
+    (tmp_path / "elsewhere" / teacher_id(base_dir) / "56x70/train/scene_1.safetensors").unlink()
     assert rows[0]["proxies"].shape == (2, *SIZE)  # only the rows that are accessed are read
     assert rows["group_id"][:] == ["scene_0", "scene_1"]
     with pytest.raises(FileNotFoundError, match="scene_1"):

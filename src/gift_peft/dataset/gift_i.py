@@ -8,9 +8,8 @@ import glob
 import hashlib
 import os
 import re
-import shlex
 from collections import Counter
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -25,11 +24,21 @@ from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
 from gift_peft.captures.tree import list_groups, raw_example
-from gift_peft.dataset.proxies import FORMAT, ProxyStore, SurfaceSettings, SurfaceStore, default_proxies_dir
-from gift_peft.dataset.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
+from gift_peft.dataset.proxies import (
+    EARLIER,
+    FORMAT,
+    ProxyStore,
+    SurfaceSettings,
+    SurfaceStore,
+    default_proxies_dir,
+    has_earlier_set,
+    proxies_command,
+    stored_sizes,
+)
+from gift_peft.dataset.rows import IMAGE_COLUMNS, RowRules
 from gift_peft.files import is_hub_id, reason
 from gift_peft.images import image_digest, natural_key
-from gift_peft.models.identity import teacher_id, teacher_revision
+from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
 
 FEATURES = Features(
@@ -126,13 +135,15 @@ def load_gift_i(
     weights and the decoded images. Slices, shuffles, selections and DataLoader workers keep them.
 
     Args:
-        path (`str` or `Path`): a prepared folder, a raw tree, a folder of parquet files, or a hub dataset id.
+        path (`str` or `Path`): a prepared folder, a raw tree, a folder of parquet files, what `save_to_disk` wrote, or
+            a hub dataset id.
         split (`str`): "train" or "validation", slices such as "train[:10]" included.
         teacher (`str` or `Path`, *optional*): the base model whose proxies to attach, a hub id or a folder.
         proxies_dir (`str` or `Path`, *optional*): where `gift-peft proxies` wrote them; default as it has it, the
             dataset's own `proxies` folder (see `default_proxies_dir`).
         revision (`str`, *optional*): of the teacher.
-        size (`tuple[int, int]`, *optional*): (h, w) that the proxies must have.
+        size (`tuple[int, int]`, *optional*): (h, w) of the proxies; default that of the set that is there, if it is
+            the only one.
         dataset_revision (`str`, *optional*): of a hub dataset.
         surface (`SurfaceSettings`, *optional*): with a teacher, attaches the surface targets made with these settings:
             accessed rows also have `surface_target` and `surface_target_flipped` (N, h, w), float32 tensors.
@@ -148,35 +159,19 @@ def load_gift_i(
         identity = teacher_id(teacher, revision)
         proxies = Path(proxies_dir) if proxies_dir else default_proxies_dir(path, identity)
         expected = {"format": FORMAT, "teacher": identity, "revision": teacher_revision(teacher, revision)}
-        if size is not None:
-            expected["size"] = f"{size[0]}x{size[1]}"
-        folder = str(proxies / identity / name)
-        command = partial(proxies_command, teacher, path, expected.get("size"), proxies_dir, revision)
-        rules = replace(rules, proxies=ProxyStore(folder, expected, command()))
+        if has_earlier_set(proxies / identity) and Path(teacher).is_dir():
+            expected[EARLIER] = earlier_revision(teacher)
+        wanted = None if size is None else f"{size[0]}x{size[1]}"
+        sizes = [wanted] if wanted else sorted(stored_sizes(proxies / identity, name))
+        if len(sizes) > 1:
+            raise ValueError(f"dataset {path}: proxies of {identity} at {' and '.join(sizes)}: give the size")
+        expected |= {"size": sizes[0]} if sizes else {}
+        command = partial(proxies_command, teacher, path, wanted, proxies_dir, revision)
+        place = (str(proxies / identity), expected.get("size", "<size>"), name)
+        rules = replace(rules, proxies=ProxyStore(*place, expected, command()))
         if surface is not None:
-            store = SurfaceStore(folder, expected | surface.header(), command(surface))
-            rules = replace(rules, surface=store)
-    return dataset.with_format(FORMAT_TYPE, rules=rules)
-
-
-def proxies_command(
-    teacher, path, size=None, proxies_dir=None, revision=None, surface: SurfaceSettings | None = None
-) -> str:
-    """The shell command that makes these proxies, or surface targets."""
-    options = {
-        "--base": teacher,
-        "--dataset": path,
-        "--size": size,
-        "--proxies_dir": proxies_dir,
-        "--revision": revision,
-    }
-    if surface is not None:
-        options["--target"] = "surface"
-        for field in fields(surface):
-            value = getattr(surface, field.name)
-            options[f"--{field.name}"] = None if value == field.default else value
-    given = [part for option, value in options.items() if value is not None for part in (option, str(value))]
-    return shlex.join(["gift-peft", "proxies", *given])
+            rules = replace(rules, surface=SurfaceStore(*place, expected | surface.header(), command(surface)))
+    return rules.apply(dataset)
 
 
 def gift_i_splits(path: str | Path) -> list[str]:
@@ -184,6 +179,8 @@ def gift_i_splits(path: str | Path) -> list[str]:
     folder = Path(path)
     if not folder.is_dir():
         return [name for name in SPLITS if name in datasets.get_dataset_split_names(str(path))]
+    if saved := _saved_splits(folder):
+        return [name for name in SPLITS if name in saved]
     prepared = _prepared_splits(folder)
     if prepared or not _holds_parquet(folder):
         return prepared or list(list_groups(folder))
@@ -192,6 +189,26 @@ def gift_i_splits(path: str | Path) -> list[str]:
 
 def _prepared_splits(folder: Path) -> list[str]:
     return [name for name in SPLITS if any((folder / name).glob("metadata.*"))]
+
+
+def _saved_splits(folder: Path) -> dict[str, datasets.Dataset]:
+    """What `Dataset.save_to_disk` or `DatasetDict.save_to_disk` left in a folder; empty for any other folder."""
+    if not any((folder / name).is_file() for name in ("state.json", "dataset_dict.json")):
+        return {}
+    saved = datasets.load_from_disk(str(folder))
+    return dict(saved) if isinstance(saved, datasets.DatasetDict) else {str(saved.split): saved}
+
+
+def _load_saved(saved: dict[str, datasets.Dataset], split: str, path: str | Path) -> datasets.Dataset:
+    """The rows of a split, or a slice of it, without what was added to them."""
+    _check_split(split, saved, path)
+    name = re.match(r"\w*", str(split)).group()
+    (part,) = datasets.ReadInstruction.from_spec(str(split)).to_absolute({name: len(saved[name])})
+    rows = saved[name].with_format(None)
+    if missing := FEATURES.keys() - rows.features.keys():
+        raise ValueError(f"dataset {path}: it lacks the column {min(missing)} of GIFT-I")
+    rows = rows.select_columns(list(FEATURES)).select(range(part.from_, part.to))
+    return rows if rows.features == FEATURES else rows.cast(FEATURES)
 
 
 def _holds_parquet(folder: Path) -> bool:
@@ -206,6 +223,8 @@ def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.D
     try:
         if not folder.is_dir():
             return _load_from_hub(str(path), split, revision)
+        if saved := _saved_splits(folder):
+            return _load_saved(saved, split, path)
         if prepared := _prepared_splits(folder):
             # Named here, not left to the card: without one, `datasets` guesses splits from words in path names.
             # Escaped, because they are patterns, and a folder may be called "data [v2]".
@@ -347,7 +366,7 @@ def dataset_fingerprint(dataset: datasets.Dataset) -> str:
     The same for raw tree, prepared folder and parquet of the same groups, and for any order of the groups.
     """
     digests = []
-    groups = dataset.with_format(FORMAT_TYPE, rules=RowRules(parsed=True))
+    groups = RowRules(parsed=True).apply(dataset)
     for group in tqdm(groups, desc="reading the dataset", unit="group", delay=2):
         digest = hashlib.sha256(group.group_id.encode())
         for name, image, mask in zip(group.names, group.images, group.masks, strict=True):

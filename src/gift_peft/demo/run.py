@@ -4,6 +4,7 @@ Everything goes through the code that real runs use; only the settings differ. T
 depth, and the base was pre-trained on rooms without a mirror or glass (`examples/tools/embedded/`).
 """
 
+import filecmp
 import os
 import shutil
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from gift_peft.demo.validation_page import validation_page
 from gift_peft.evaluation.evaluate import evaluate_gift_i
 from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.tables import markdown_table, text_table
-from gift_peft.files import whole_folder, write_whole
+from gift_peft.files import read_yaml, strangers, whole_folder, write_whole
 from gift_peft.models.loading import DepthModel
 from gift_peft.options import use_color
 from gift_peft.reports.figures import before_after
@@ -25,8 +26,10 @@ from gift_peft.reports.model_card import run_length
 from gift_peft.reports.panels import group_panels
 from gift_peft.training import train
 from gift_peft.training.arguments import parse_arguments
+from gift_peft.training.run_folder import holds_run
 
 SIZE = "112x140"
+OUTPUTS = ("before_after.png", "validation.html", "report.md", "evaluation-proxy", "evaluation-depth")
 KINDS = {"mirror": "mirror", "pane": "glass pane", "solid": "glass object"}
 # What differs from the paper's settings, because the model is 200 times smaller and the groups are fewer: so few
 # updates need a high learning rate, which must fall for depths to settle, and less distillation to agree in time.
@@ -53,9 +56,9 @@ def run_demo(
         extra: training arguments that win over the demo's, as on the command line (`--lambda_d=0`).
 
     Raises:
-        ValueError: `out` holds a run already, or an argument is wrong.
+        ValueError: `out` holds a run already, or files in the demo's way that no demo wrote, or an argument is wrong.
     """
-    out = Path(out)
+    out = Path(out).expanduser()
     own = [f"--model_name_or_path={out}/base", f"--dataset_name={out}/gift-i", f"--output_dir={out}"]
     own += [f"--size={SIZE}", f"--seed={seed}", *SETTINGS, "--license=apache-2.0"]
     if overwrite_output_dir:
@@ -66,12 +69,17 @@ def run_demo(
     for name, value in (("model_name_or_path", f"{out}/base"), ("dataset_name", f"{out}/gift-i"), ("output_dir", out)):
         if Path(getattr(args, name)) != Path(value):
             raise ValueError(f"{name}: the demo has its own; choose the folder with --out, or use `gift-peft train`")
-    if (out / "metrics.jsonl").exists() and not overwrite_output_dir and not args.resume_from_checkpoint:
+    if holds_run(out) and not overwrite_output_dir and not args.resume_from_checkpoint:
         raise ValueError(
             f"out: {out} already holds a run; --overwrite_output_dir deletes it, --out names another folder"
         )
+    earlier = _holds_demo(out)
+    if not earlier and (there := [name for name in OUTPUTS if (out / name).exists()]):
+        raise ValueError(
+            f"out: {out} has {', '.join(there)}, which no demo wrote: it is kept; --out names another folder"
+        )
     for name in ("base", "gift-i"):
-        _copy_embedded(name, out / name)
+        _copy_embedded(name, out / name, earlier)
     result = train(args)
     if result.signal:
         raise KeyboardInterrupt
@@ -91,12 +99,27 @@ def run_demo(
     return reports
 
 
-def _copy_embedded(name: str, destination: Path) -> None:
-    """A folder of the package, replaced as a whole; proxies made for the very same content stay."""
+def _holds_demo(out: Path) -> bool:
+    """Whether the run in a folder is a demo's: of the base and the groups beside it."""
+    if not holds_run(out) or not (out / "config.yaml").is_file():
+        return False
+    arguments = read_yaml(out / "config.yaml")
+    names = [Path(str(arguments.get(key))).name for key in ("model_name_or_path", "dataset_name")]
+    return names == ["base", "gift-i"]
+
+
+def _copy_embedded(name: str, destination: Path, earlier: bool) -> None:
+    """A folder of the package; that of an `earlier` demo is replaced as a whole where it differs.
+
+    Proxies stay: they are checked against what they were made for.
+    """
     with as_file(files("gift_peft.demo") / name) as source:
         if not source.is_dir():
             raise FileNotFoundError(f"the installed package lacks gift_peft/demo/{name}; install it again")
-        with whole_folder(destination) as place:
+        contents = strangers(source)
+        if filecmp.cmpfiles(source, destination, contents, shallow=False)[0] == contents:
+            return
+        with whole_folder(destination, [*contents, "proxies/*"] if earlier else ()) as place:
             shutil.copytree(source, place, dirs_exist_ok=True)
             if (destination / "proxies").is_dir():
                 os.replace(destination / "proxies", place / "proxies")

@@ -19,7 +19,7 @@ import yaml
 from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.files import read_yaml
 from gift_peft.models.pixels import parse_size
-from gift_peft.options import OptionParser
+from gift_peft.options import OptionParser, expand_home
 
 # What a run may be resumed with when it differs: everything else changes the weights that come out.
 FREE_TO_CHANGE = {
@@ -206,8 +206,8 @@ class GiftTrainingArguments:
 
     def __post_init__(self):
         for name in _names():
-            if isinstance(value := getattr(self, name), Path):
-                setattr(self, name, str(value))
+            if isinstance(value := getattr(self, name), str | Path):
+                setattr(self, name, expand_home(str(value)))
         if self.mixed_precision == "fp16":
             raise ValueError("mixed_precision: fp16 would need a loss scaler around the group step; use bf16 or no")
         if str(self.retain) != "auto":
@@ -309,7 +309,7 @@ def parse_arguments(argv: Sequence[str]) -> GiftTrainingArguments:
     config.add_argument("--config", type=Path)
     parser = make_parser()
     config.error = parser.error = _raise
-    path = config.parse_known_args(argv)[0].config
+    path = expand_home(config.parse_known_args(argv)[0].config)
     from_file = [] if path is None else _yaml_to_argv(path)
     for option in (word.partition("=")[0] for word in argv if word.startswith("--")):
         if not parser.knows(option):

@@ -20,9 +20,11 @@ from peft import PeftModel
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import GiftRecipe, get_gift_model, get_recipe
 from gift_peft.dataset.cache import default_cache_dir
-from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
+from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.loader import PreparedGroups
+from gift_peft.dataset.proxies import proxies_command
 from gift_peft.dataset.tensors import Group
+from gift_peft.models.identity import weights_revision
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.models.pixels import resolve_size
 from gift_peft.reports.model_card import model_card
@@ -137,6 +139,7 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult
         "mixed_precision": accelerator.mixed_precision,
         "num_processes": accelerator.num_processes,
         "base_revision": identity["model_name_or_path"],
+        "base_weights": weights_revision(args.model_name_or_path, args.model_revision),
         "dataset_fingerprint": identity["dataset_name"],
     }
     save = partial(_save_adapter, args, network, processor, about, schedule.epoch_steps)

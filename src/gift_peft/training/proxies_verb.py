@@ -72,11 +72,14 @@ def _write_page(args: Namespace, settings: SurfaceSettings, folder: Path) -> Pat
     """The page of all splits asked for, whole or not at all."""
     from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
     from gift_peft.dataset.rows import parsed
+    from gift_peft.models.pixels import parse_size
     from gift_peft.reports.targets_page import targets_page
 
     places = {"proxies_dir": args.proxies_dir, "revision": args.revision, "surface": settings}
+    places["size"] = parse_size(folder.name)
     splits = args.splits or gift_i_splits(args.dataset)
     groups = chain.from_iterable(parsed(load_gift_i(args.dataset, split, args.base, **places)) for split in splits)
-    kind = read_header(next(folder.glob(f"*/*{SURFACE_SUFFIX}.safetensors")))["kind"]
+    made = (place.glob(f"*/*{SURFACE_SUFFIX}.safetensors") for place in (folder, folder.parent))
+    kind = read_header(next(chain.from_iterable(made)))["kind"]
     write_whole(args.page, targets_page(groups, kind))
     return args.page

@@ -6,6 +6,7 @@ proxies, and from what the teacher predicts for the flipped photos and for fills
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,22 +17,25 @@ from accelerate.utils import gather_object, parse_flag_from_env
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
+from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.proxies import (
+    EARLIER,
     SURFACE_SUFFIX,
     ProxyStore,
     SurfaceSettings,
     default_proxies_dir,
     difference,
+    has_earlier_set,
     make_header,
     mask_digests,
     picture_digests,
+    proxies_command,
     read_header,
     write_proxies,
     write_surface,
 )
 from gift_peft.dataset.rows import parsed
-from gift_peft.models.identity import teacher_id, teacher_revision
+from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import pixel_settings, resize_mask
 from gift_peft.rules import GroupPictures
@@ -74,7 +78,7 @@ def make_proxies(
         kind (`str`, *optional*): what the teacher predicts, for surface targets; default what its recipe says.
 
     Returns:
-        `Path`: `<proxies_dir>/<teacher>`.
+        `Path`: `<proxies_dir>/<teacher>/<h>x<w>`; files that 0.1.0 made one folder higher stay there while they hold.
 
     Raises:
         ValueError, OSError: in every process, one line naming the file, or group and image: stale proxies or surface
@@ -85,7 +89,8 @@ def make_proxies(
     pinned = teacher_revision(base, revision)
     model = DepthModel.from_pretrained(base, revision=revision, size=size, kind=kind, device=state.device)
     folder = Path(proxies_dir or default_proxies_dir(dataset_path, identity)) / identity
-    place = (base, dataset_path, "x".join(map(str, model.size)), proxies_dir, revision)
+    named = "x".join(map(str, model.size))
+    place = (base, dataset_path, named, proxies_dir, revision)
     command = proxies_command(*place)
     header = make_header(identity, pinned, model.size, pixel_settings(model.processor))
     surface_header, surface_command = {}, ""
@@ -93,19 +98,26 @@ def make_proxies(
         surface_header = header | surface.header() | {"kind": model.known_kind()}
         surface_command = proxies_command(*place, surface) + (f" --kind {kind}" if kind else "")
 
-    def make(row: GroupPictures, path: Path) -> None:
+    earlier = {}
+    if has_earlier_set(folder) and Path(base).is_dir():
+        earlier = {EARLIER: earlier_revision(base)}
+
+    def make(row: GroupPictures, split: str) -> None:
         if surface is not None and row.group_id.endswith(SURFACE_SUFFIX):
             raise ValueError(f"group {row.group_id}: rename it; so the surface targets of another group are called")
-        expected = header | (pixels := picture_digests(row))
-        if (overwrite and surface is None) or not _is_current(path, expected, row.names, command, "proxy"):
-            write_proxies(path, expected, *_predict_row(model, row, batch_size))
+        store = ProxyStore(str(folder), named, split, header | earlier, command)
+        file, pixels = f"{row.group_id}.safetensors", picture_digests(row)
+        known = header | pixels
+        holds = partial(_is_current, names=row.names)
+        if (overwrite and surface is None) or not holds(store.path(file), known | earlier, command, "proxy"):
+            write_proxies(store.place(file), known, *_predict_row(model, row, batch_size))
         if surface is None:
             return
-        target_path = path.with_name(f"{row.group_id}{SURFACE_SUFFIX}.safetensors")
-        expected = surface_header | pixels | mask_digests(row)
-        if overwrite or not _is_current(target_path, expected, row.names, surface_command, "surface target"):
-            proxies, _ = ProxyStore(str(path.parent), header, command).read(row.group_id, row.names, pixels)
-            write_surface(target_path, expected, *_surface_row(model, row, proxies, surface, batch_size))
+        file = f"{row.group_id}{SURFACE_SUFFIX}.safetensors"
+        known = surface_header | pixels | mask_digests(row)
+        if overwrite or not holds(store.path(file), known | earlier, surface_command, "surface target"):
+            proxies, _ = store.read(row.group_id, row.names, pixels)
+            write_surface(store.place(file), known, *_surface_row(model, row, proxies, surface, batch_size))
 
     what = "proxies" if surface is None else "surface targets"
     problem = None
@@ -114,15 +126,14 @@ def make_proxies(
             dataset = parsed(load_gift_i(dataset_path, split))
             mine = range(state.process_index, len(dataset), state.num_processes)
             for index in tqdm(mine, desc=f"{what}, {split}", unit="group", delay=2, disable=not state.is_main_process):
-                row = dataset[index]
-                make(row, folder / split / f"{row.group_id}.safetensors")
+                make(dataset[index], split)
     except (ValueError, OSError) as error:
         problem = error
     _raise_everywhere(problem, state)
-    return folder
+    return folder / named
 
 
-def _is_current(path: Path, expected: dict, names: Sequence[str], command: str, what: str) -> bool:
+def _is_current(path: Path, expected: dict, command: str, what: str, names: Sequence[str]) -> bool:
     """Whether a group's proxies, or surface targets, exist and hold; ValueError if they exist and do not."""
     if not path.exists():
         return False

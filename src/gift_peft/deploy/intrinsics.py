@@ -1,7 +1,6 @@
 """The camera that took a photo: focal lengths and center in pixels, from a file, a field of view, or the photo's EXIF."""
 
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -106,14 +105,6 @@ class Intrinsics:
             return None
         smaller = max(width, height) / float(taken) if _is_positive(taken) else 1.0  # a photo made smaller since
         return cls.centered(float(focal) * float(density) / unit * min(1.0, smaller), width, height)
-
-
-def read_fov(text: str) -> float:
-    """An option's `type`: a horizontal field of view in degrees."""
-    match = re.fullmatch(r"\d+(\.\d+)?", text)
-    if match is None or not 1 <= float(text) < 179:
-        raise ValueError(f"{text!r} is no field of view of 1 to 179 degrees")
-    return float(text)
 
 
 def _is_positive(value: Any) -> bool:

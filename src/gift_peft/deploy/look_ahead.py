@@ -15,19 +15,24 @@ def predict_ahead(
     files: Sequence[Path],
     base_too: bool = False,
     focal_length: float | tuple[float, float] | None = None,
-    batch_size: int = 1,
+    batch_size: int | None = None,
     decoders: int = 2,
 ) -> Iterator[dict[str, np.ndarray] | Exception]:
     """In the order of the files, {"own": (H,W) float32, "base": the same of the base} or the error of that picture.
 
     Args:
-        model (`DepthModel`): predicts.
+        model: a `DepthModel`; or anything with its `depth_at`, which then takes one picture at a time.
         base_too (`bool`): with the base's depth.
-        batch_size (`int`): pictures per forward. On the CPU the bits of a prediction may depend on it.
+        batch_size (`int`, *optional*): pictures per forward; default 8 on a GPU, else 1. The last bits of a prediction
+            may depend on it.
         decoders (`int`): threads that open and resize pictures.
     """
 
+    batch_size = batch_size or _default_batch(model)
+
     def decode(file: Path) -> tuple | Exception:
+        if not hasattr(model, "depths_of"):
+            return (file,)
         try:
             picture = read_image(file)
             return model.inputs([picture]), picture.size[::-1], str(file)
@@ -68,6 +73,9 @@ def predict_ahead(
 def _depths(model: Any, opened: list[tuple], base_too: bool, focal_length: Any) -> list[Any]:
     if not opened:
         return []
+    if not hasattr(model, "depths_of"):
+        ways = {"own": False, "base": True} if base_too else {"own": False}
+        return [{way: model.depth_at(file, focal_length, base=base) for way, base in ways.items()} for (file,) in opened]
     import torch
 
     pixels, sizes, names = zip(*opened, strict=True)
@@ -76,3 +84,9 @@ def _depths(model: Any, opened: list[tuple], base_too: bool, focal_length: Any) 
         return [{"own": depth} for depth in own]
     base = model.depths_of(torch.cat(pixels), sizes, names, focal_length, base=True)
     return [{"own": first, "base": second} for first, second in zip(own, base, strict=True)]
+
+
+def _default_batch(model: Any) -> int:
+    parameters = getattr(getattr(model, "network", None), "parameters", None)
+    weight = next(parameters(), None) if parameters else None
+    return 8 if weight is not None and weight.device.type != "cpu" else 1

@@ -1,12 +1,12 @@
 """A depth map as colored points (`--pointcloud ply|glb`), without the veils that edges would draw between surfaces."""
 
+import importlib.util
 import io
 
 import numpy as np
 
 from gift_peft.deploy.intrinsics import Intrinsics
 
-FORMATS = ("ply", "glb")
 EDGE = 0.04  # relative step to a neighbor, beyond what a plane does, at which a pixel lies on an edge
 
 
@@ -45,17 +45,18 @@ def to_points(
 
 
 def encode_points(points: np.ndarray, colors: np.ndarray, form: str) -> bytes:
-    """A file of points: `ply` with the axes of a camera (x right, y down, z away), `glb` with those of glTF (y up).
+    """A file of points: `ply` with the axes of a camera (x right, y down, z away), `glb` with those of glTF (y up)."""
+    import trimesh
 
-    Raises ImportError, with the command to type, without trimesh.
-    """
-    try:
-        import trimesh
-    except ImportError:
-        raise ImportError('--pointcloud needs trimesh: pip install "gift-peft[pointcloud]"') from None
     if form == "glb":
         points = points * np.float32([1, -1, -1])
     cloud = trimesh.PointCloud(points, np.c_[colors, np.full(len(colors), 255, np.uint8)])
     content = io.BytesIO()
     cloud.export(content, file_type=form)
     return content.getvalue()
+
+
+def check_trimesh() -> None:
+    """ValueError, with the command to type, where trimesh is not installed."""
+    if importlib.util.find_spec("trimesh") is None:
+        raise ValueError('point clouds need trimesh: pip install "gift-peft[pointcloud]"')

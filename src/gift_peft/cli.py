@@ -16,7 +16,7 @@ VERBS = {
     "export": ("dataset.export_verb", "a dataset as parquet shards with a card, to share or stream"),
     "proxies": ("training.proxies_verb", "keep the frozen model's predictions for a dataset"),
     "train": ("training.__main__", "fine-tune a model on groups of images into an adapter"),
-    "evaluate": ("evaluation.verb", "compare base and adapter on validation groups, or on Booster"),
+    "evaluate": ("deploy.evaluate_verb", "compare base and adapter on validation groups, or on Booster"),
     "predict": ("predict", "depth of pictures, beside the base's"),
     "report": ("reports.report_verb", "tables, figures and model card of runs, from what they left behind"),
     "convert": ("models.convert_verb", "official VGGT or Metric3D V2 weights to a transformers folder"),

@@ -88,7 +88,7 @@ def fill_sensor_depth(
     inverse = _inverse_depth(scale * prediction + shift, kind, farthest)
     rejected = np.zeros_like(there)
     if mask is None:
-        rejected = _outliers(1 / sensor - inverse, there)
+        rejected = _outliers(1 / sensor, inverse, there)
         trusted = there & ~_grow(rejected)
     replaced = ~there | (rejected if mask is None else mask)
     error = float(np.median(np.abs(1 / (inverse[trusted] * sensor[trusted]) - 1)))
@@ -177,10 +177,11 @@ def _inverse_depth(aligned: np.ndarray, kind: str, farthest: float) -> np.ndarra
     return 1 / np.clip(aligned, farthest / FAR / 1000, farthest)
 
 
-def _outliers(residual: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Blobs of sensor pixels that the fit does not explain: neither single pixels nor edges."""
-    noise = 1.4826 * np.median(np.abs(residual[there]))
-    far = (there & (np.abs(residual) > OUTLIER * noise)).astype(np.uint8)
+def _outliers(truth: np.ndarray, fit: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Blobs of sensor pixels that the fit does not explain: neither single pixels nor edges, nor what is a few percent."""
+    residual = np.abs(truth - fit)
+    noise = 1.4826 * np.median(residual[there])
+    far = (there & (residual > OUTLIER * noise) & (residual > TOLERANCE * np.maximum(truth, fit))).astype(np.uint8)
     size = max(1, round(max(far.shape) / 100)) * 2 + 1
     far = cv2.morphologyEx(far, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
     _, label, statistics, _ = cv2.connectedComponentsWithStats(far)

@@ -47,8 +47,8 @@ def read_depth(path: Path, unit: str | None = None) -> np.ndarray:
     else:
         image = open_image(path)
         if image.mode != "F" and not image.mode.startswith("I"):
-            deep = "8-bit " if image.mode in ("L", "P", "1") else ""
-            raise ValueError(f"{path}: a {deep}picture of mode {image.mode}; depth is a 16-bit PNG in mm, or an npy in m")
+            deep = "an 8-bit" if image.mode in ("L", "P", "1") else "a"
+            raise ValueError(f"{path}: {deep} picture of mode {image.mode}; depth is a 16-bit PNG in mm, or an npy in m")
         values = np.asarray(image)
     taken = unit or ("m" if values.dtype.kind == "f" else "mm")
     whole = values.dtype.kind != "f"

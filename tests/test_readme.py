@@ -34,6 +34,9 @@ ONLY_PARSED = {  # the start of a command: why it is not run here
     "gift-peft train --config examples/": "needs a large model",
     "gift-peft train --config run.yaml": "the file is the reader's",
     "gift-peft prepare RAW gift-i --layout": "needs files in that layout; tests/captures/test_foreign.py has them",
+    "gift-peft predict rgb": "needs files of a sensor; tests/deploy/test_predict_metric.py has them",
+    "gift-peft predict --video": "needs a clip; tests/deploy/test_predict_metric.py has one",
+    "gift-peft evaluate --sensor-depth": "needs files of a sensor; tests/deploy/test_sensor_evaluation.py has them",
     "gift-peft evaluate --booster booster --predictions": "tests/evaluation/test_stored_predictions.py has the files",
 }
 IN_CI = [

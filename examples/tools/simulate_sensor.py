@@ -1,7 +1,7 @@
 """Depth of a simulated sensor for a dataset with true depth, as `gift-peft evaluate --sensor-depth` reads it.
 
-    python examples/tools/simulate_sensor.py demo/gift-i sensor
-    gift-peft evaluate --base demo/base --adapter demo/adapter --dataset demo/gift-i --sensor-depth sensor
+python examples/tools/simulate_sensor.py demo/gift-i sensor
+gift-peft evaluate --base demo/base --adapter demo/adapter --dataset demo/gift-i --sensor-depth sensor
 """
 
 import argparse

@@ -29,7 +29,9 @@ def table(path, depth, pixels, column="depth_m", factor=1.0):
 @pytest.mark.parametrize(("column", "factor"), [("depth_m", 1), ("depth_mm", 1000)])
 def test_two_points_make_a_perfect_prediction_metric(kind, column, factor, tmp_path):
     depth, prediction = scene(kind)
-    found, worst = table(tmp_path / "p.csv", depth, [(1, 2), (45, 30)], column, factor).apply(PHOTO, prediction, kind, None)
+    found, worst = table(tmp_path / "p.csv", depth, [(1, 2), (45, 30)], column, factor).apply(
+        PHOTO, prediction, kind, None
+    )
     np.testing.assert_allclose(found, depth, rtol=1e-5)
     assert worst < 1e-4
 

@@ -32,7 +32,7 @@ def test_yaml_of_three_kinds(tmp_path):
     (tmp_path / "d.yaml").write_text("fx: 921\nwidth: 4\nheight: -3\n")
     with pytest.raises(ValueError, match=r"camera .*d\.yaml: no positive number for fy, cx, cy, height; it takes"):
         Intrinsics.from_yaml(tmp_path / "d.yaml")
-    with pytest.raises(FileNotFoundError, match="camera .*gone"):
+    with pytest.raises(FileNotFoundError, match=r"camera .*gone"):
         Intrinsics.from_yaml(tmp_path / "gone.yaml")
 
 

@@ -1,4 +1,4 @@
-"""`gift-peft predict` with a sensor, taped distances, cameras and clips, as it is typed: files, lines and exit codes."""
+"""`gift-peft predict` with a sensor, taped distances, cameras and clips, as typed: files, lines and exit codes."""
 
 import json
 import shutil
@@ -33,7 +33,7 @@ def model(demo):
 
 @pytest.fixture
 def work(demo, model, tmp_path, monkeypatch):
-    """Two photos, what a sensor says of them (glass is 0.8 m farther), and masks: a world in which the model is right."""
+    """Two photos, a sensor's depth of them (glass is 0.8 m farther), and masks; the model is right."""
     random = np.random.default_rng(0)
     for folder in ("rgb", "depth", "masks"):
         (tmp_path / folder).mkdir()
@@ -81,7 +81,7 @@ def test_sensor_depth_gives_metric_depth_confidence_and_what_was_replaced(demo, 
         assert (confidence[~replaced] == 255).all() and confidence[replaced].min() < 255
         # the 16-bit picture of the prediction itself says how to read it
         deep = Image.open(f"out/{index}_16bit.png")
-        row = json.loads(open("out/metric.json").read())[index]
+        row = json.loads((work / "out" / "metric.json").read_text())[index]
         native = np.load(f"out/{index}.npy")
         scale, offset = row["png16"]["scale"], row["png16"]["offset"]
         np.testing.assert_allclose(np.asarray(deep) * scale + offset, native, atol=0.51 * scale)
@@ -106,7 +106,7 @@ def test_sizes_may_differ_and_without_masks_the_fit_finds_the_glass(demo, work, 
         (lambda d: d[:, :70], ["60x70", "the photo 60x80", "another camera or crop"]),
         (lambda d: np.zeros_like(d), ["no depth at all"]),
         (lambda d: np.maximum(d // 1000, 1), ["taken as mm", "--sensor-unit m"]),
-        (lambda d: (d[::-1, ::-1]), ["depth/0.png: "]),
+        (lambda d: d[::-1, ::-1], ["depth/0.png: "]),
     ],
     ids=["another size", "all zero", "metres", "unregistered"],
 )

@@ -1,4 +1,4 @@
-"""Filling a sensor's depth: exact where the model is exact, robust where the sensor is wrong, honest where it is not."""
+"""Filling a sensor's depth: exact where the model is, robust where the sensor is wrong, honest about the rest."""
 
 import numpy as np
 import pytest

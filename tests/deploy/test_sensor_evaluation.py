@@ -25,7 +25,7 @@ pytestmark = [
 
 @pytest.fixture
 def scene(tmp_path):
-    """One group of two pictures with true depth, its sensor, and a model that knows the depth: (rows, depths, folder)."""
+    """One group of two pictures with true depth, and its sensor: (rows, depth, mask, folder)."""
     rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
     depth = 1500 + 10.0 * rows + 6 * columns
     mask = np.zeros(SIZE, bool)

@@ -76,7 +76,9 @@ def test_names_pair_by_themselves_and_without_the_words_for_their_kind():
         "a.jpg": "a.npy",
         "b.jpg": "b.png",
     }
-    found = pair_files(paths("01-transparent-rgb-img.jpg", "x_Color_7.png"), paths("x_Depth_7.png", "01_depth.png"), "d", 0)
+    found = pair_files(
+        paths("01-transparent-rgb-img.jpg", "x_Color_7.png"), paths("x_Depth_7.png", "01_depth.png"), "d", 0
+    )
     assert names(found) == {"01-transparent-rgb-img.jpg": "01_depth.png", "x_Color_7.png": "x_Depth_7.png"}
     assert names(pair_files(paths("photo.jpg"), paths("anything.png"), "depth", 0)) == {"photo.jpg": "anything.png"}
     with pytest.raises(ValueError, match=r"both a\.npy and a\.png would belong to one photo"):
@@ -105,7 +107,10 @@ def test_times_in_names_pair_within_a_tolerance(factor):
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.lists(st.integers(0, 400), min_size=2, max_size=8, unique=True), st.lists(st.integers(0, 400), min_size=2, max_size=8, unique=True))
+@given(
+    st.lists(st.integers(0, 400), min_size=2, max_size=8, unique=True),
+    st.lists(st.integers(0, 400), min_size=2, max_size=8, unique=True),
+)
 def test_no_file_is_used_twice_and_no_pair_is_too_far_apart(first, second):
     start = 1_700_000_000.0
     photos, files = (paths(*(f"{start + 0.001 * value:.4f}.png" for value in side)) for side in (first, second))
@@ -129,5 +134,5 @@ def test_masks_must_be_there_for_every_photo_with_depth(tmp_path):
     assert len(SensorFiles.find(photos, tmp_path / "depth").depths) == 2
     with pytest.raises(ValueError, match=r"b\.jpg: no mask in .*mask"):
         SensorFiles.find(photos, tmp_path / "depth", tmp_path / "mask")
-    with pytest.raises(FileNotFoundError, match="sensor depth .*nowhere: no such file or folder"):
+    with pytest.raises(FileNotFoundError, match=r"sensor depth .*nowhere: no such file or folder"):
         SensorFiles.find(photos, tmp_path / "nowhere")

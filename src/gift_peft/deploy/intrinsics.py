@@ -1,4 +1,4 @@
-"""The camera that took a photo: focal lengths and center in pixels, from a file, a field of view, or the photo's EXIF."""
+"""The camera that took a photo: focal lengths and center in pixels, from a file, a field of view, or EXIF."""
 
 import math
 from dataclasses import dataclass

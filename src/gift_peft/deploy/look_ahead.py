@@ -75,7 +75,9 @@ def _depths(model: Any, opened: list[tuple], base_too: bool, focal_length: Any) 
         return []
     if not hasattr(model, "depths_of"):
         ways = {"own": False, "base": True} if base_too else {"own": False}
-        return [{way: model.depth_at(file, focal_length, base=base) for way, base in ways.items()} for (file,) in opened]
+        return [
+            {way: model.depth_at(file, focal_length, base=base) for way, base in ways.items()} for (file,) in opened
+        ]
     import torch
 
     pixels, sizes, names = zip(*opened, strict=True)

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gift_peft.options import number
@@ -28,7 +27,9 @@ def add_metric_options(parser: argparse.ArgumentParser) -> None:
     sensor.add_argument("--calibrate", metavar="CSV", help=text)
     cloud = parser.add_argument_group("point clouds")
     cloud.add_argument("--pointcloud", choices=["ply", "glb"], help="a file of colored points per photo")
-    cloud.add_argument("--camera", metavar="YAML", help="fx fy cx cy width height, or ROS's; default: the photo's EXIF")
+    cloud.add_argument(
+        "--camera", metavar="YAML", help="fx fy cx cy width height, or ROS's; default: the photo's EXIF"
+    )
     cloud.add_argument("--fov", type=_fov, metavar="DEGREES", help="horizontal field of view, in place of --camera")
     clip = parser.add_argument_group("clips")
     clip.add_argument("--video", metavar="CLIP", help="a clip, or the number of a camera, in place of photos")
@@ -57,7 +58,7 @@ def check_metric_options(parser: argparse.ArgumentParser, args: argparse.Namespa
 
 
 def make_outputs(args: argparse.Namespace) -> "MetricOutputs | None":
-    """What the options ask for, with every file found and paired before a model is loaded; None if they ask nothing."""
+    """What the options ask for, with every file found and paired before a model is loaded; None if nothing is."""
     if not (args.sensor_depth or args.calibrate or args.png16 or args.pointcloud):
         return None
     from gift_peft.deploy.calibration import Calibration

@@ -26,8 +26,9 @@ FARTHEST = 65535  # of a 16-bit picture
 class MetricOutputs:
     """What is asked for, and for each photo the files that it gives.
 
-    `<name>_metric.npy` (float32, metres), `<name>_metric.png` (16 bits, millimetres, 0 unknown), `<name>_confidence.png`
-    (8 bits, 255 is 1) and `<name>_replaced.png` (255 where the sensor's value was not kept) with a sensor;
+    `<name>_metric.npy` (float32, metres), `<name>_metric.png` (16 bits, millimetres, 0 unknown),
+    `<name>_confidence.png` (8 bits, 255 is 1) and `<name>_replaced.png` (255 where the sensor's value was not kept) with
+    a sensor;
     `<name>_metric.*` with a calibration; `<name>_16bit.png`; `<name>.ply` or `.glb`.
 
     Args:
@@ -82,7 +83,7 @@ class MetricOutputs:
         return metric + (["_confidence", "_replaced"] if self.sensor else []) + (["_16bit"] if self.png16 else [])
 
     def finish(self, folder: Path) -> str | None:
-        """Writes `metric.json`, one object per photo, and returns a line that sums it up; None if nothing was metric."""
+        """Writes `metric.json`, one object per photo; a line that sums it up, None if nothing was metric."""
         if not self.rows or not (self.sensor or self.calibration or self.png16):
             return None
         write_whole(folder / "metric.json", json.dumps(jsonable(self.rows), indent=1) + "\n")

@@ -1,9 +1,9 @@
 """Metric depth from a depth sensor that is wrong on glass, and a prediction that is right there but has no unit.
 
-1. Where the sensor can be trusted, scale and shift bring the prediction to it, robustly, in the prediction's own space
-   (inverse depth to inverse depth).
-2. About each hole a local fit, in inverse depth where planes are flat, bends that: the nearer, the more it counts; with
-   no news it stays what it was. What it leaves at the border of the hole fades inwards: the spatially smooth residual.
+1. Where the sensor can be trusted, scale and shift bring the prediction to it, robustly, in the prediction's own
+   space (inverse depth to inverse depth).
+2. About each hole a local fit, in inverse depth where planes are flat, bends that: the nearer, the more it counts;
+   with no news it stays what it was. What it leaves at the border of the hole fades inwards: the spatially smooth residual.
 3. Holes and target take that; everywhere else the sensor's own value stays.
 """
 
@@ -73,7 +73,7 @@ def fill_sensor_depth(
     Raises:
         ValueError: shapes that disagree, a prediction that is not finite, an unknown kind, a sensor without values
             (outside the target).
-        UnrelatedDepthError: (a ValueError) no increasing fit of the sensor to the prediction, in a scene that has depth.
+        UnrelatedDepthError: (a ValueError) no increasing fit of the sensor to the prediction.
     """
     prediction, sensor = np.asarray(prediction, np.float64), np.asarray(sensor, np.float64)
     _check(prediction, sensor, mask, kind)
@@ -108,9 +108,7 @@ def fill_sensor_depth(
     )
 
 
-def align_to_sensor(
-    prediction: np.ndarray, sensor: np.ndarray, trusted: np.ndarray, kind: str
-) -> tuple[float, float]:
+def align_to_sensor(prediction: np.ndarray, sensor: np.ndarray, trusted: np.ndarray, kind: str) -> tuple[float, float]:
     """Scale and shift that bring a prediction to metric (inverse) depth, by `robust_line` over the trusted pixels.
 
     `prediction`, `sensor` (> 0 where `trusted`) and `trusted` are (H,W). In inverse depth differences count as they
@@ -178,7 +176,7 @@ def _inverse_depth(aligned: np.ndarray, kind: str, farthest: float) -> np.ndarra
 
 
 def _outliers(truth: np.ndarray, fit: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Blobs of sensor pixels that the fit does not explain: neither single pixels nor edges, nor what is a few percent."""
+    """Blobs of sensor pixels that the fit does not explain; not single pixels, edges, or what is a few percent."""
     residual = np.abs(truth - fit)
     noise = 1.4826 * np.median(residual[there])
     far = (there & (residual > OUTLIER * noise) & (residual > TOLERANCE * np.maximum(truth, fit))).astype(np.uint8)
@@ -227,7 +225,7 @@ def _fit_region(
 ) -> tuple[np.ndarray, float]:
     """Inverse depth of a window bent to the sensor about one region of it, and the noise of the fit.
 
-    A robust, regularized fit of truth on [line, row, column, 1], weighted by nearness, then its residual faded inwards.
+    A robust, regularized fit of truth on [line, row, column, 1], weighted by nearness; then its residual faded in.
     """
     step = -(-max(line.shape) // WINDOW)
     at = np.s_[step // 2 :: step, step // 2 :: step]

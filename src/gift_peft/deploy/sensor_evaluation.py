@@ -70,9 +70,15 @@ class SensorReport:
         scored = [row for row in self.rows if not row["skipped"]]
         covered = f"{self.coverage['tom']:.0f} % of the target and {self.coverage['other']:.0f} % of the rest"
         notes = [f"The sensor has a value at {covered}, and is scored there alone; the others everywhere."]
-        notes.append(f"Metric depth, no alignment to the truth; means over images. Scored: {len(scored)} of {len(self.rows)}.")
-        notes += sorted({f"{row['group_id']}, {row['image']}: {row['skipped']}" for row in self.rows if row["skipped"]})[:3]
-        return Table("Sensor depth, filled (mm)", ["region", ""], [METRIC_NAMES[m] for m in METRICS], lines[:-1], notes=notes)
+        notes.append(
+            f"Metric depth, no alignment to the truth; means over images. Scored: {len(scored)} of {len(self.rows)}."
+        )
+        notes += sorted(
+            {f"{row['group_id']}, {row['image']}: {row['skipped']}" for row in self.rows if row["skipped"]}
+        )[:3]
+        return Table(
+            "Sensor depth, filled (mm)", ["region", ""], [METRIC_NAMES[m] for m in METRICS], lines[:-1], notes=notes
+        )
 
 
 def evaluate_sensor(

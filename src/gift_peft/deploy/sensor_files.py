@@ -18,8 +18,8 @@ from gift_peft.images import SUFFIXES, natural_key, open_image, to_mask
 DEPTH_SUFFIXES = {".npy", ".png", ".tif", ".tiff"}
 UNITS = {"m": 1.0, "mm": 0.001}
 # Words that say what a picture is, not which: `a_rgb.png`, `a_depth.png` and `a_mask.png` belong together.
-KIND_WORDS = {"rgb", "color", "colour", "image", "img", "photo", "depth", "mask", "aligned", "raw", "sensor", "mm"}
-KIND_WORDS |= {"transparent", "opaque", "label", "rect", "to"}
+KIND_WORDS = {"rgb", "color", "colour", "image", "img", "photo", "depth", "mask", "label", "aligned", "raw", "mm"}
+KIND_WORDS |= {"sensor", "transparent", "opaque", "rect", "to"}
 TIME = re.compile(r"(?:.*[^\d.])?(\d{9,}(?:\.\d+)?|\d+\.\d+)")  # 1305031102.175304, frame_1305031102175304000
 ASPECT = 0.02  # by which the ratios of width to height may differ
 
@@ -30,8 +30,8 @@ def read_depth(path: Path, unit: str | None = None) -> np.ndarray:
     Args:
         unit (*optional*): `m`, `mm`, or metres per value as a number ("0.0001"); default by the file's type.
 
-    Raises FileNotFoundError or ValueError in one line: no depth file, an 8-bit or color picture, no value in it, values
-    that must be in another unit.
+    Raises FileNotFoundError or ValueError in one line: no depth file, an 8-bit or color picture, no value in it,
+    values that must be in another unit.
     """
     if path.suffix.lower() == ".npy":
         try:
@@ -48,7 +48,9 @@ def read_depth(path: Path, unit: str | None = None) -> np.ndarray:
         image = open_image(path)
         if image.mode != "F" and not image.mode.startswith("I"):
             deep = "an 8-bit" if image.mode in ("L", "P", "1") else "a"
-            raise ValueError(f"{path}: {deep} picture of mode {image.mode}; depth is a 16-bit PNG in mm, or an npy in m")
+            raise ValueError(
+                f"{path}: {deep} picture of mode {image.mode}; depth is a 16-bit PNG in mm, or an npy in m"
+            )
         values = np.asarray(image)
     taken = unit or ("m" if values.dtype.kind == "f" else "mm")
     whole = values.dtype.kind != "f"
@@ -205,9 +207,7 @@ def _pair_by_time(
     candidates = []
     for photo in photos:
         low, high = np.searchsorted(ordered, [times[photo] - tolerance, times[photo] + tolerance])
-        candidates += [
-            (abs(times[file] - times[photo]), photo, file) for file in by_time[max(0, low - 1) : high + 1]
-        ]
+        candidates += [(abs(times[file] - times[photo]), photo, file) for file in by_time[max(0, low - 1) : high + 1]]
     found: dict[Path, Path] = {}
     taken: set[Path] = set()
     for distance, photo, file in sorted(candidates, key=lambda item: (item[0], str(item[1]), str(item[2]))):

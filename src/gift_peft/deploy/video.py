@@ -1,4 +1,4 @@
-"""A clip or a camera, frame by frame (`gift-peft predict --video`): photo, base and adapted side by side in a new clip.
+"""A clip or a camera, frame by frame (`gift-peft predict --video`): photo, base and adapted side by side.
 
 With a mask it also measures flicker inside the target, for a camera that stands still: each frame is aligned by scale
 and shift to the first one outside the target, and the standard deviation over time is taken pixel by pixel.

@@ -340,7 +340,7 @@ class Scorer:
         self.target_pixels = int(np.count_nonzero(self.target))
 
     def __call__(self, prediction: Any) -> tuple[dict, np.ndarray | None, str | None]:
-        """Scores and aligned (H,W) of a (h,w) prediction of any size; NaN and why where there is nothing to compare."""
+        """Scores and aligned (H,W) of a (h,w) prediction of any size; NaN and why if there is nothing to compare."""
         task = self.task
         nothing = {"scale": float("nan"), "shift": float("nan"), "num_clipped": 0, "num_nonpositive": 0}
         nothing |= {region: dict.fromkeys(METRICS, float("nan")) for region in REGIONS}

@@ -1,7 +1,7 @@
 """What an error means to a robot, where true depth is known: glass that is not there, and depth that shakes.
 
 False free space: percent of the target's pixels reported more than 10 % and more than 200 mm behind the surface.
-Flicker: standard deviation, in mm, of aligned depth at a pixel of the target over the observations of its group, in the
+Flicker: standard deviation, in mm, of aligned depth at a pixel of the target over its group's observations, in the
 mean over pixels. Both are taken of the aligned depth of the evaluation's protocol.
 """
 

@@ -32,8 +32,8 @@ NO_TEACHING = (
 )
 INTERVALS = "In brackets: 95 % bootstrap intervals over groups (2,000 draws of whole groups, percentiles)."
 SAFETY = (
-    "False free space: target pixels reported more than 10 % and 200 mm behind the surface. Flicker: standard deviation "
-    "inside the target over a group, in mm."
+    "False free space: target pixels reported more than 10 % and 200 mm behind the surface. Flicker: standard "
+    "deviation inside the target over a group, in mm."
 )
 BACKBONE_UNITS = "Proxies are each backbone's own: compare a backbone with its adapted form only."
 

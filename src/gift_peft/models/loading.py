@@ -246,8 +246,8 @@ class DepthModel:
             if not torch.isfinite(depth).all():
                 raise ValueError(f"{name}: the prediction has NaN or infinite values")
         if getattr(getattr(self.network, "config", None), "model_type", None) in RESIZED_HERE:
-            maps = output.predicted_depth[:, None, None]
-            depths = [nn.functional.interpolate(own, tuple(size), mode="bicubic") for own, size in zip(maps, sizes)]
+            pairs = zip(output.predicted_depth[:, None, None], sizes, strict=True)
+            depths = [nn.functional.interpolate(own, tuple(size), mode="bicubic") for own, size in pairs]
         else:
             depths = [own["predicted_depth"] for own in post_process(output, target_sizes=list(sizes), **options)]
         # transformers squeezes a side of one pixel away

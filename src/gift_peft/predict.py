@@ -94,6 +94,9 @@ def predict_images(
     names = _unique_names(files, ends + (outputs.suffixes() if outputs else []))
     folder = Path(out)
     stems = [stem for name in names for stem in ([name] if adapter is None else [name, f"{name}_base"])]
+    if outputs is not None:
+        stems += [name + end for name in names for end in outputs.suffixes()]
+        outputs.check(folder, names, _is_ours)
     _check_outputs(folder, stems, files)
     model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
     folder.mkdir(parents=True, exist_ok=True)
@@ -113,7 +116,7 @@ def predict_images(
                 raise result
             depths = {name: result["own"]} | ({f"{name}_base": result["base"]} if "base" in result else {})
             if outputs is not None:
-                outputs.write(folder, name, file, depths[name], model.known_kind(), model.millimeters_per_unit)
+                outputs.write(folder, name, file, depths[name], model.kind, model.millimeters_per_unit)
         except ValueError as error:  # of this picture: the others are still wanted
             wrong.append(str(error))
             continue

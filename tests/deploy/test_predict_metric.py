@@ -202,6 +202,20 @@ def test_metric_files_of_the_verb_are_those_of_the_function(demo, work, model, c
     np.testing.assert_array_equal(np.load("out/0_metric.npy"), filled.depth)
 
 
+def test_files_of_others_are_kept_and_own_ones_replaced(demo, work, capsys):
+    pytest.importorskip("trimesh", reason="the extra `pointcloud` is not installed")
+    words = ["rgb/0.png", "--sensor-depth=depth/0.png", "--sensor-mask=masks/0.png", "--pointcloud=ply", "--fov=60"]
+    (work / "out").mkdir()
+    for name in ("0_metric.png", "0_replaced.png", "0.ply", "metric.json"):
+        (work / "out" / name).write_text("mine")
+        code, _, err = run(demo, capsys, *words)
+        assert code == 1 and f"{name} was not written by gift-peft predict and is kept" in err
+        assert [path.name for path in (work / "out").iterdir()] == [name]
+        (work / "out" / name).unlink()
+    for _ in range(2):
+        assert run(demo, capsys, *words)[0] == 0
+
+
 # ---- clips ----
 
 
@@ -239,6 +253,15 @@ def test_a_clip_shows_photo_base_and_adapted_and_its_flicker(still, demo, work, 
     assert there and frame.shape == (64, 3 * 96, 3)
     assert np.abs(frame[:, :96].astype(int) - frames[0]).mean() < 12
     assert sorted(path.name for path in (work / "out").iterdir()) == ["in_depth.json", "in_depth.mp4"]
+
+
+def test_a_clip_of_others_is_kept(demo, work, capsys):
+    write_clip("in.mp4", [np.zeros((64, 96, 3), np.uint8)] * 2)
+    (work / "out").mkdir()
+    (work / "out" / "in_depth.mp4").write_text("mine")
+    code, _, err = run(demo, capsys, "--video=in.mp4")
+    assert code == 1 and "in_depth.mp4 was not written by gift-peft predict and is kept" in err
+    assert (work / "out" / "in_depth.mp4").read_text() == "mine"
 
 
 def test_a_mask_of_another_shape_leaves_no_clip(demo, work, capsys):

@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from gift_peft.files import jsonable, write_whole
 from gift_peft.images import read_image
 
 FARTHEST = 65535  # of a 16-bit picture
+SUMMARY = "metric.json"
 
 
 @dataclass
@@ -27,8 +29,8 @@ class MetricOutputs:
     """What is asked for, and for each photo the files that it gives.
 
     `<name>_metric.npy` (float32, metres), `<name>_metric.png` (16 bits, millimetres, 0 unknown),
-    `<name>_confidence.png` (8 bits, 255 is 1) and `<name>_replaced.png` (255 where the sensor's value was not kept) with
-    a sensor;
+    `<name>_confidence.png` (8 bits, 255 is 1) and `<name>_replaced.png` (255 where the sensor's value was not
+    kept) with a sensor;
     `<name>_metric.*` with a calibration; `<name>_16bit.png`; `<name>.ply` or `.glb`.
 
     Args:
@@ -47,16 +49,31 @@ class MetricOutputs:
     fov: float | None = None
     rows: list[dict[str, Any]] = field(default_factory=list)
 
-    def write(self, folder: Path, name: str, photo: Path, depth: np.ndarray, kind: str, unit: float) -> None:
+    def check(self, folder: Path, names: Sequence[str], is_ours: Callable[[Path], bool]) -> None:
+        """ValueError for a file that would be replaced though `gift-peft predict` did not write it.
+
+        `names` are those of the photos' files; `is_ours` tells it of a PNG.
+        """
+        for name in names:
+            for path in (folder / f"{name}.ply", folder / f"{name}.glb"):
+                if path.suffix[1:] == self.pointcloud and path.exists() and not is_ours(folder / f"{name}.png"):
+                    raise ValueError(f"{path} was not written by gift-peft predict and is kept: choose another folder")
+        summary = folder / SUMMARY
+        if summary.exists() and not summary.read_bytes().lstrip().startswith(b'[\n {\n  "photo":'):
+            raise ValueError(f"{summary} was not written by gift-peft predict and is kept: choose another folder")
+
+    def write(self, folder: Path, name: str, photo: Path, depth: np.ndarray, kind: str | None, unit: float) -> None:
         """The files of one photo, all computed before the first is written.
 
         Args:
             depth (`np.ndarray`): (H,W) float32, the prediction in native units.
-            kind (`str`): what it is, `depth` or `inverse_depth`.
+            kind (`str`, *optional*): what it is, `depth` or `inverse_depth`; None where nothing says it.
             unit (`float`): millimetres per native unit of a metric model, else 1.
 
         Raises ValueError in one line that names the photo or the file that does not go with it.
         """
+        if kind is None:
+            raise ValueError("nothing says what the model predicts: give --kind depth or --kind inverse_depth")
         row: dict[str, Any] = {"photo": photo.name}
         files: dict[str, bytes] = {}
         metric = depth * (unit / 1000) if kind == "depth" and unit != 1 else None
@@ -86,7 +103,7 @@ class MetricOutputs:
         """Writes `metric.json`, one object per photo; a line that sums it up, None if nothing was metric."""
         if not self.rows or not (self.sensor or self.calibration or self.png16):
             return None
-        write_whole(folder / "metric.json", json.dumps(jsonable(self.rows), indent=1) + "\n")
+        write_whole(folder / SUMMARY, json.dumps(jsonable(self.rows), indent=1) + "\n")
         if self.sensor is not None:
             replaced, error = (np.median([row[key] for row in self.rows]) for key in ("replaced", "relative_error"))
             return (

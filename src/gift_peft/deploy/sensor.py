@@ -3,7 +3,8 @@
 1. Where the sensor can be trusted, scale and shift bring the prediction to it, robustly, in the prediction's own
    space (inverse depth to inverse depth).
 2. About each hole a local fit, in inverse depth where planes are flat, bends that: the nearer, the more it counts;
-   with no news it stays what it was. What it leaves at the border of the hole fades inwards: the spatially smooth residual.
+   with no news it stays what it was. What it leaves at the border of the hole fades inwards: the spatially smooth
+   residual.
 3. Holes and target take that; everywhere else the sensor's own value stays.
 """
 

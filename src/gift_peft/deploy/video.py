@@ -100,6 +100,10 @@ def predict_video(
     if Path(source).exists() and clip.exists() and clip.samefile(source):
         capture.release()
         raise ValueError(f"{clip} would be written over the clip that is read: choose another --out")
+    facts = clip.with_suffix(".json")
+    if any(path.exists() for path in (clip, facts)) and not (facts.is_file() and b'"clip":' in facts.read_bytes()):
+        capture.release()
+        raise ValueError(f"{clip} was not written by gift-peft predict and is kept: choose another folder")
     models = ["base", "adapted"] if model.adapted else ["base"]
     state = _Clip(partial, rate, models, model.kind or "inverse_depth", str(source))
     begin = time.perf_counter()

@@ -177,10 +177,14 @@ def _inverse_depth(aligned: np.ndarray, kind: str, farthest: float) -> np.ndarra
 
 
 def _outliers(truth: np.ndarray, fit: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Blobs of sensor pixels that the fit does not explain; not single pixels, edges, or what is a few percent."""
-    residual = np.abs(truth - fit)
-    noise = 1.4826 * np.median(residual[there])
-    far = (there & (residual > OUTLIER * noise) & (residual > TOLERANCE * np.maximum(truth, fit))).astype(np.uint8)
+    """Blobs of sensor pixels far behind the fit (both inverse depth); not single pixels, edges, or a few percent.
+
+    Behind alone, because that is where a sensor looks through glass and into mirrors: what it sees before the fit is
+    more likely something that the model has missed.
+    """
+    behind = fit - truth
+    noise = 1.4826 * np.median(np.abs(behind[there]))
+    far = (there & (behind > OUTLIER * noise) & (behind > TOLERANCE * fit)).astype(np.uint8)
     size = max(1, round(max(far.shape) / 100)) * 2 + 1
     far = cv2.morphologyEx(far, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
     _, label, statistics, _ = cv2.connectedComponentsWithStats(far)

@@ -107,3 +107,18 @@ def test_a_group_of_a_long_name_is_rejected_alone(places):
         (raw / name).rename(raw / "a")
     (raw / "a").rename(raw / ("g" * 210))
     assert [entry["status"] for entry in prepare_gift_i(raw, out)["groups"]] == ["kept", "kept"]
+
+
+def test_a_card_edited_by_hand_is_not_replaced(places):
+    raw, out = places
+    prepare_gift_i(raw, out)  # one that was not edited is written again
+    card = out / "README.md"
+    card.write_text(card.read_text() + "Cite us.\n")
+    with pytest.raises(ValueError, match=r"README\.md: changed since gift-peft prepare wrote it") as error:
+        prepare_gift_i(raw, out)
+    assert "\n" not in str(error.value) and card.read_text().endswith("Cite us.\n")
+    card.unlink()
+    prepare_gift_i(raw, out)
+    assert "Cite us" not in card.read_text()
+    (out / ".prepare/card").unlink()  # as before 0.2.0
+    prepare_gift_i(raw, out)

@@ -70,8 +70,9 @@ def _difference(base: str | Path, revision: str | None, adapter: str | Path, mad
     is_folder, was_folder = Path(base).is_dir(), pinned.startswith((TENSORS, FILES))
     if not trained and pinned.startswith(FILES) and is_folder and pinned == earlier_revision(base):
         return None
-    if not trained and made_for and (Path(made_for) / "config.json").is_file():
-        trained = weights_revision(made_for)
+    if not trained and made_for and (was_folder or Path(made_for).exists()):
+        found = locate(made_for, Path(adapter)) or locate(made_for, Path(adapter).parent)
+        trained = weights_revision(found) if found is not None and (found / "config.json").is_file() else ""
     if trained:
         return weights_difference(trained, weights_revision(base, revision))
     if was_folder and is_folder:

@@ -72,7 +72,7 @@ def weights_revision(base: str | Path, revision: str | None = None) -> str:
     """
     folder = _config_file(base, revision).parent
     paths = _weight_files(folder, base)
-    tensors = "-".join(_digest_tensors(_stats(paths), str(base)))
+    tensors = "-".join(_digest_tensors(_stats(paths, base), str(base)))
     return f"{TENSORS}{tensors}-{_digest_config(folder)}"
 
 
@@ -80,7 +80,7 @@ def earlier_revision(base: str | Path) -> str:
     """What pinned a folder's weights in 0.1.0: a digest of the files of its configuration and weights."""
     files = [Path(base) / name for name in ("config.json", "preprocessor_config.json")]
     files += sorted(path for path in Path(base).iterdir() if path.suffix in (".safetensors", ".bin"))
-    return f"{FILES}{_digest_files(_stats([path for path in files if path.exists()]))}"
+    return f"{FILES}{_digest_files(_stats([path for path in files if path.exists()], base))}"
 
 
 def weights_difference(one: str, other: str) -> str | None:
@@ -123,8 +123,10 @@ def _weight_files(folder: Path, base: str | Path) -> list[Path]:
     return []
 
 
-def _stats(paths: list[Path]) -> tuple[tuple[str, int, int], ...]:
-    """Names, and what tells that a file has changed."""
+def _stats(paths: list[Path], base: str | Path) -> tuple[tuple[str, int, int], ...]:
+    """Names, and what tells that a file has changed; FileNotFoundError for one that is not there."""
+    if missing := [path.name for path in paths if not path.is_file()]:
+        raise FileNotFoundError(f"base model {base}: {missing[0]} is missing")
     return tuple((str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in paths)
 
 
@@ -147,8 +149,6 @@ def _digest_tensors(stats: tuple[tuple[str, int, int], ...], base: str) -> tuple
         raise ValueError(
             f"base model {base}: its weights are a pickle that would run code; take safetensors"
         ) from None
-    except FileNotFoundError as error:
-        raise FileNotFoundError(f"base model {base}: {Path(str(error.filename)).name} is missing") from None
     except (SafetensorError, RuntimeError, ValueError, LookupError, EOFError, TypeError, AttributeError) as error:
         raise ValueError(f"base model {base}: its weights cannot be read ({reason(error)})") from None
     finally:

@@ -24,7 +24,7 @@ from gift_peft.options import package_version
 from gift_peft.prepare.entries import Statistics
 from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import FORMAT, Job, Outcome
-from gift_peft.prepare.out_folder import alone, check_places, side_by_side
+from gift_peft.prepare.out_folder import alone, check_card, check_places, note_card, side_by_side
 from gift_peft.prepare.page import write_html
 from gift_peft.prepare.settings import PrepareSettings
 from gift_peft.rules import MAX_GROUP_ID, SPLITS
@@ -56,7 +56,8 @@ def prepare_gift_i(
 
     Raises:
         ValueError, FileNotFoundError: one line; `raw` or `out` is not what it should be, another run is at work in
-            `out`, or a group would replace a file there that this function did not write, or that was changed since.
+            `out`, or a group or the card would replace a file there that this function did not write, or that was
+            changed since.
             What concerns one group of `raw` never raises.
     """
     raw, out = Path(raw), Path(out)
@@ -69,6 +70,7 @@ def prepare_gift_i(
     jobs = [Job(raw, staging, source, split, settings) for split in SPLITS for source in groups.get(split, [])]
     _check_names(jobs)
     with alone("prepare", out, STATE):
+        check_card("prepare", out, STATE)
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir()
         report, rows = _make_groups(raw, out, settings, jobs, num_proc)
@@ -78,6 +80,7 @@ def prepare_gift_i(
         else:
             for name in ("README.md", "groups.jsonl"):
                 (out / name).unlink(missing_ok=True)
+        note_card(out, STATE)
         write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False))
         write_html(out, report)
     return report

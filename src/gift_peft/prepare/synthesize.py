@@ -25,7 +25,7 @@ from gift_peft.captures.tree import Capture, check_masks, find_groups, read_capt
 from gift_peft.files import read_yaml, remove_folder, strangers, whole_folder, write_whole
 from gift_peft.images import image_digest, is_image_file, read_image
 from gift_peft.prepare.job import capture_digest, printable
-from gift_peft.prepare.out_folder import alone, check_places, side_by_side
+from gift_peft.prepare.out_folder import alone, check_card, check_places, note_card, side_by_side
 from gift_peft.rules import SPLITS, check_group_id
 from gift_peft.surface_targets import paint_fills
 
@@ -119,6 +119,7 @@ def synthesize_groups(
     report = SynthesisReport()
     jobs = _list_jobs(photos, out / "train", fills, seed, report)
     with alone(VERB, out, STATE):
+        check_card(VERB, out, STATE)
         _tidy(out / "train", {job.folder.name for job in jobs}, report)
         outcomes = {}
         with tqdm(total=len(jobs), desc="photos", unit="photo", disable=None, delay=2) as bar:
@@ -134,6 +135,7 @@ def synthesize_groups(
             if outcome.made:
                 report.made.append(job.folder.name)
         _write_card(photos, out, len(report.groups), fills)
+        note_card(out, STATE)
     return report
 
 

@@ -100,7 +100,7 @@ def test_real_scenes_keep_the_sensor_outside_the_target(tmp_path):
 
     groups = []
     for folder in sorted(path for path in CLEARGRASP.iterdir() if path.is_dir()):
-        small = {name: Image.open(folder / name).resize((320, 180), 0) for name in ("transparent.jpg", "mask.png")}
+        small = {name: Image.open(folder / name).resize((322, 182), 0) for name in ("transparent.jpg", "mask.png")}
         clear, sprayed = (Image.open(folder / f"{kind}_depth_mm.png") for kind in ("transparent", "opaque"))
         groups.append(
             {
@@ -109,7 +109,7 @@ def test_real_scenes_keep_the_sensor_outside_the_target(tmp_path):
                 "surface": "transparent",
                 "images": [small["transparent.jpg"]],
                 "masks": [np.asarray(small["mask.png"].convert("L")) > 127],
-                "depths": [np.asarray(sprayed.resize((320, 180), 0)).astype(np.uint16)],
+                "depths": [np.asarray(sprayed.resize((322, 182), 0)).astype(np.uint16)],
                 "reference": small["transparent.jpg"],
             }
         )
@@ -124,7 +124,7 @@ def test_real_scenes_keep_the_sensor_outside_the_target(tmp_path):
         return torch.from_numpy(np.where(truth > 0, 500 / np.maximum(truth, 1), 0.5))[None].float()
 
     processor = tiny_processor()
-    model = DepthModel(network, processor, (180, 320), "inverse_depth")
+    model = DepthModel(network, processor, (182, 322), "inverse_depth")
     report = evaluate_sensor(dataset, model, tmp_path / "sensor", progress=False)
     assert all(row["skipped"] is None for row in report.rows)
     for row in report.rows:

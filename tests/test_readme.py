@@ -37,6 +37,12 @@ ONLY_PARSED = {  # the start of a command: why it is not run here
     "gift-peft predict rgb": "needs files of a sensor; tests/deploy/test_predict_metric.py has them",
     "gift-peft predict --video": "needs a clip; tests/deploy/test_predict_metric.py has one",
     "gift-peft evaluate --sensor-depth": "needs files of a sensor; tests/deploy/test_sensor_evaluation.py has them",
+    "gift-peft deploy demo/adapter onnx": "exports a minute; tests/deploy/test_onnx_export.py has all forms",
+    "gift-peft deploy demo/adapter openvino": "exports a minute; tests/deploy/test_onnx_export.py has all forms",
+    "gift-peft deploy demo/adapter int8": "exports a minute; tests/deploy/test_onnx_export.py has all forms",
+    "gift-peft deploy demo/adapter dialed": "exports a minute; tests/deploy/test_onnx_export.py has all forms",
+    "gift-peft deploy demo/adapter space": "exports a minute; tests/deploy/test_space.py runs the page",
+    "gift-peft predict photos --deployed": "needs an export; tests/deploy/test_runtime.py has small ones",
     "gift-peft evaluate --booster booster --predictions": "tests/evaluation/test_stored_predictions.py has the files",
 }
 IN_CI = [

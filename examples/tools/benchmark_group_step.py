@@ -32,7 +32,7 @@ from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 from benchmark.epoch import Stratum, Timing, make_strata
 from benchmark.models import CONFIGS, PAPER_MINUTES, Config
-from benchmark.report import METHODS, machine, to_markdown
+from benchmark.report import METHODS, TITLE, machine, replace_section, to_markdown
 from PIL import Image
 
 from gift_peft.adapters.recipes import get_gift_model
@@ -388,7 +388,7 @@ def main() -> None:
     print(text)
     if args.out:
         (args.out / "benchmark.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        (args.out / "benchmark.md").write_text(text, encoding="utf-8")
+        replace_section(args.out / "benchmark.md", TITLE, text)
 
 
 if __name__ == "__main__":

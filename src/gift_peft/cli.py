@@ -18,6 +18,7 @@ VERBS = {
     "train": ("training.__main__", "fine-tune a model on groups of images into an adapter"),
     "evaluate": ("deploy.evaluate_verb", "compare base and adapter on validation groups, or on Booster"),
     "predict": ("predict", "depth of pictures, beside the base's"),
+    "deploy": ("deploy.deploy_verb", "an adapter and its base as one model that runs elsewhere"),
     "report": ("reports.report_verb", "tables, figures and model card of runs, from what they left behind"),
     "convert": ("models.convert_verb", "official VGGT or Metric3D V2 weights to a transformers folder"),
 }

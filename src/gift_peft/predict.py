@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -60,6 +60,8 @@ def predict_images(
     accept_base: bool = False,
     outputs: "MetricOutputs | None" = None,
     batch_size: int | None = None,
+    deployed: str | Path | None = None,
+    backend: str | None = None,
     progress: bool = True,
 ) -> list[Path]:
     """Writes `<stem>.npy` and `<stem>.png` per picture and, with an adapter, `<stem>_base.npy/.png` beside them.
@@ -76,6 +78,8 @@ def predict_images(
         focal_length (*optional*): of the camera in pixels, as in `DepthModel.depth_at`.
         outputs (`MetricOutputs`, *optional*): what else is written of each picture.
         batch_size (`int`, *optional*): pictures per forward; default 8 on a GPU, else 1.
+        deployed (*optional*): a folder that `gift-peft deploy` exported, in place of base and adapter.
+        backend (`str`, *optional*): what computes a deployed model, `onnx` or `openvino`.
 
     Returns:
         `list[Path]`: the npy file of each picture.
@@ -87,23 +91,31 @@ def predict_images(
     """
     from gift_peft.colormap import color_range, colorize  # not for `--help`, which needs neither OpenCV nor torch
     from gift_peft.deploy.look_ahead import predict_ahead
-    from gift_peft.models.loading import DepthModel
 
     files = list_images(images)
-    ends = ["_base"] if adapter is not None else []
+    model: Any = None
+    if deployed is not None:
+        from gift_peft.deploy.deployed import DeployedModel
+
+        model = DeployedModel(deployed, backend, adapter_scale)
+    beside = adapter is not None if model is None else model.adapted
+    ends = ["_base"] if beside else []
     names = _unique_names(files, ends + (outputs.suffixes() if outputs else []))
     folder = Path(out)
-    stems = [stem for name in names for stem in ([name] if adapter is None else [name, f"{name}_base"])]
+    stems = [name + end for name in names for end in ["", *ends]]
     if outputs is not None:
         stems += [name + end for name in names for end in outputs.suffixes()]
         outputs.check(folder, names, _is_ours)
     _check_outputs(folder, stems, files)
-    model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
+    if model is None:
+        from gift_peft.models.loading import DepthModel
+
+        model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
     folder.mkdir(parents=True, exist_ok=True)
     mark = PngInfo()
     mark.add_text(*MARK)
     made, wrong = [], []
-    results = predict_ahead(model, files, adapter is not None, focal_length, batch_size)
+    results = predict_ahead(model, files, beside, focal_length, batch_size)
     for file, name, result in tqdm(
         zip(files, names, results, strict=True),
         desc="predict",
@@ -186,6 +198,10 @@ def make_parser() -> OptionParser:
     add_adapter(parser)
     text = "of the camera that took the pictures, where the model takes one (Metric3D)"
     parser.add_argument("--focal-length", type=float, metavar="PIXELS", help=text)
+    text = "a folder of `gift-peft deploy --to onnx|openvino|int8`, in place of --base and --adapter"
+    parser.add_argument("--deployed", metavar="DIR", help=text)
+    text = "what computes a deployed model; default: what it was exported for"
+    parser.add_argument("--backend", choices=["onnx", "openvino"], help=text)
     parser.add_argument("--out", "--output-dir", required=True, metavar="DIR", help="folder for the npy and png files")
     add_metric_options(parser)
     return parser
@@ -194,10 +210,19 @@ def make_parser() -> OptionParser:
 def run(argv: Sequence[str]) -> int:
     parser = make_parser()
     args = parser.parse_args(argv)
-    if args.base is None and args.adapter is None:
-        parser.error("one of --base and --adapter is required")
+    if args.deployed is not None:
+        fixed = ("base", "adapter", "revision", "size", "kind")
+        given = [f"--{name}" for name in fixed if getattr(args, name) is not None]
+        if given:
+            parser.error(f"--deployed brings its own model: leave {', '.join(given)} out")
+    elif args.backend is not None:
+        parser.error("--backend computes a model named by --deployed")
+    elif args.base is None and args.adapter is None:
+        parser.error("one of --base, --adapter and --deployed is required")
     check_metric_options(parser, args)
     if args.video is not None:
+        if args.deployed is not None:
+            parser.error("--video takes --base or --adapter, not --deployed")
         return run_video(args)
     reasons: list[str] = []
     outputs = make_outputs(args)
@@ -216,6 +241,8 @@ def run(argv: Sequence[str]) -> int:
             accept_base=args.accept_base,
             outputs=outputs,
             batch_size=args.batch_size,
+            deployed=args.deployed,
+            backend=args.backend,
         )
     except PicturesWithoutDepth as error:
         files, reasons = error.paths, error.reasons

@@ -95,6 +95,28 @@ def test_profile_prints_where_the_time_goes_and_writes_nothing(base_dir, raw_tre
     assert all(f"{phase} " in text for phase in PHASES) and "TFLOP/s" in text and "retain auto: up to" in text
 
 
+def test_a_section_of_the_page_is_replaced_alone(modules, tmp_path):
+    from benchmark.report import replace_section
+
+    page = tmp_path / "benchmark.md"
+    replace_section(page, "One", "1\n\n## Deeper\n\n2\n")
+    replace_section(page, "Two", "3")
+    replace_section(page, "One", "4")
+    assert page.read_text() == "# One\n\n4\n\n# Two\n\n3\n"
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_exports_runs(tmp_path):
+    command = [sys.executable, str(EXAMPLES / "benchmark_deploy.py"), "--repeats", "1", "--exports", "small"]
+    command += ["--out", str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    assert result.returncode == 0, result.stderr
+    text = (tmp_path / "benchmark.md").read_text()
+    for way in ("torch", "onnxruntime", "OpenVINO (float32)", "onnxruntime, int8"):
+        assert f"\n| {way} |" in text
+    assert "\n| V2-Small |" in text
+
+
 @pytest.mark.slow
 def test_the_benchmark_runs(tmp_path):
     command = [sys.executable, str(EXAMPLES / "benchmark_group_step.py"), "--models", "tiny", "vggt-1b"]

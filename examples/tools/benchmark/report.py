@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import shlex
 import sys
 from importlib.metadata import version
@@ -11,6 +12,7 @@ import torch
 
 from gift_peft.training.profiling import PHASES
 
+TITLE = "Speed of the group step"
 METHODS = {
     "a": "naive pair traversal",
     "b": "snapshot and replay (paper)",
@@ -35,11 +37,22 @@ def machine() -> dict:
     }
 
 
+def replace_section(page: Path, title: str, text: str) -> None:
+    """Put `text` under the heading `# title` of a page, in place of what stood there; other sections stay."""
+    old = page.read_text(encoding="utf-8") if page.exists() else ""
+    sections = [part for part in re.split(r"(?m)^(?=# )", old) if part.strip()]
+    new = f"# {title}\n\n{text.rstrip()}\n\n"
+    at = [index for index, part in enumerate(sections) if part.startswith(f"# {title}\n")]
+    if at:
+        sections[at[0]] = new
+    else:
+        sections.append(new)
+    page.write_text("\n\n".join(part.strip() for part in sections) + "\n", encoding="utf-8")
+
+
 def to_markdown(results: dict) -> str:
     facts = results["machine"]
     lines = [
-        "# Speed of the group step",
-        "",
         f"`OMP_NUM_THREADS={facts['threads']} {facts['command']}` on "
         f"{facts['cores']} cores ({facts['cpu']}), {facts['threads']} threads, load {facts['load_at_start']:.1f} "
         f"when it started. Python {facts['python']}, "

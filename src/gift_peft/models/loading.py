@@ -135,6 +135,9 @@ class DepthModel:
             if adapter is not None:
                 base, revision = find_base(base, adapter, revision)
             network, processor = load_base(base, revision, with_processor=not _brings_processor(adapter))
+        if adapter is None and Path(base).is_dir():  # a merged model says at what size it was trained
+            merged = read_gift(base)
+            size, kind = size or merged.get("size"), kind or _stated_kind(network) or merged.get("kind")
         if adapter is not None:
             network, processor = _attach(network, processor, base, adapter, revision, accept_base)
             kind = kind or _stated_kind(network) or read_gift(adapter).get("kind")

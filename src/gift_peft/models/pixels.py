@@ -42,7 +42,7 @@ def resolve_size(size, recipe=None, processor=None, config=None) -> tuple[int, i
     if not size:
         raise ValueError("the image processor states no height and width; give a size, for example --size 476x644")
     height, width = parse_size(size) if isinstance(size, str) else (int(side) for side in size)
-    multiple = _size_multiple(processor, config)
+    multiple = size_multiple(processor, config)
     if height < 1 or width < 1 or height % multiple or width % multiple:
         near = tuple(max(multiple, round(side / multiple) * multiple) for side in (height, width))
         raise ValueError(
@@ -54,7 +54,7 @@ def resolve_size(size, recipe=None, processor=None, config=None) -> tuple[int, i
     return height, width
 
 
-def _size_multiple(processor, config) -> int:
+def size_multiple(processor, config) -> int:
     backbone = getattr(config, "backbone_config", None)
     candidates = (
         getattr(processor, "ensure_multiple_of", None),

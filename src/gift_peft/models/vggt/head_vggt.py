@@ -21,16 +21,19 @@ def position_map(channels: int, grid: tuple[int, int], image: tuple[int, int], l
 
     Coordinates are relative to the image's diagonal, so the map shows the aspect ratio.
     """
-    # Sines of doubles, as precise on every device that has them.
-    dtype = torch.float32 if like.device.type == "mps" else torch.float64
+    # Sines of doubles, as precise on every device that has them; an exported graph may run on one that has none.
+    single = like.device.type == "mps" or torch.compiler.is_exporting()
+    dtype = torch.float32 if single else torch.float64
     count = channels // 4
     frequency = 100.0 ** -(torch.arange(count, device=like.device, dtype=dtype) / count)
-    diagonal = (image[0] ** 2 + image[1] ** 2) ** 0.5
+    # Sides as tensors: numbers worked out from them would be constants of an exported graph.
+    sides = [torch.full((), side, device=like.device, dtype=dtype) for side in image]
+    diagonal = (sides[0] ** 2 + sides[1] ** 2).sqrt()
     parts = []
     for axis in (1, 0):
         cells = grid[axis]
-        reach = image[axis] / diagonal * (cells - 1) / cells
-        angles = frequency[:, None] * torch.linspace(-reach, reach, cells, device=like.device, dtype=dtype)
+        places = 2 * torch.arange(cells, device=like.device, dtype=dtype) - (cells - 1)  # from the middle, half cells
+        angles = frequency[:, None] * (places * (sides[axis] / diagonal / cells))
         for wave in (angles.sin(), angles.cos()):
             wave = (wave * POSITION_MAP_SCALE).to(like.dtype)
             parts.append((wave[:, None, :] if axis == 1 else wave[:, :, None]).expand(count, *grid))

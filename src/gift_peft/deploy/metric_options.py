@@ -111,7 +111,7 @@ def _fov(text: str) -> float:
 
 def _unit(text: str) -> str:
     if text not in ("m", "mm"):
-        _checked(lambda word: _within(float(word), 1e-7, 1, "m per value"), text)
+        _checked(lambda word: _within(float(word), 1e-7, 1e3, "m per value"), text)
     return text
 
 

@@ -67,7 +67,7 @@ def _errors(
 ) -> list[float] | None:
     """[base, surface target]: RMSE inside the mask; None where nothing is known there."""
     protocol = replace(get_protocol(REFERENCES[against]), resolution=1.0)
-    score = Scorer(Observation("", {}, reference, mask, valid), Task([], protocol, kind, 1.0, ""))
+    score = Scorer(Observation("", {}, reference, mask, valid), Task([], protocol, kind, 1.0, "", in_mm=False))
     errors = [score(prediction)[0]["tom"]["rmse"] for prediction in (base, target)]
     return errors if all(map(math.isfinite, errors)) else None
 

@@ -30,6 +30,10 @@ NO_TEACHING = (
     "these groups cannot teach accuracy."
 )
 INTERVALS = "In brackets: 95 % bootstrap intervals over groups (2,000 draws of whole groups, percentiles)."
+SAFETY = (
+    "False free space: target pixels reported more than 10 % and 200 mm behind the surface. Flicker: standard "
+    "deviation inside the target over a group, in mm."
+)
 BACKBONE_UNITS = "Proxies are each backbone's own: compare a backbone with its adapted form only."
 
 
@@ -99,6 +103,8 @@ def notes(report: Report) -> list[str]:
         lines.append(NO_TEACHING)
     if report.unit == "mm":
         lines.append(f"{report.gce_name} is in the model's own units, not in mm.")
+    if report.safety:
+        lines.append(SAFETY)
     return [*lines, protocol_note(report), skipped_note(report)]
 
 
@@ -163,6 +169,9 @@ def _pairs(report: Report) -> list[list[str | Cell] | None]:
     gce, name = report.gce, report.gce_name
     pairs: list[list[str | Cell] | None] = [_pair(f"{name} ↓", gce["base"], gce["adapted"])]
     pairs.append(_pair(f"{name} normalised ↓", gce["base_normalized"], gce["adapted_normalized"]))
+    for label, name in (("False free space % ↓", "false_free_space"), ("Flicker mm ↓", "flicker")):
+        if report.safety:
+            pairs.append(_pair(label, *(report.safety.get(model, {}).get(name) for model in ("base", "adapted"))))
     for surface, entry in report.by_surface.items():
         models = (entry["base"], entry["summary"] if report.adapted else None, entry["consensus"])
         values = [model and model["tom"]["rmse"] for model in models]

@@ -237,22 +237,36 @@ class DepthModel:
         elif not isinstance(image, str | Path | Image.Image):
             raise ValueError(f"{name}: a path, a PIL picture or a uint8 array is expected, not {type(image).__name__}")
         picture = read_image(image, name)
+        return self.depths_of(self.inputs([picture]), [picture.size[::-1]], [name], focal_length, base)[0]
+
+    def depths_of(
+        self,
+        pixel_values: torch.Tensor,
+        sizes: Sequence[tuple[int, int]],
+        names: Sequence[str],
+        focal_length: float | tuple[float, float] | None = None,
+        base: bool = False,
+    ) -> list[np.ndarray]:
+        """`depth_at` of several pictures in one forward: `inputs` of them, their (height, width), and what to call
+        them in messages."""
         post_process, options = self.processor.post_process_depth_estimation, {}
         if focal_length is not None:
             if "focal_lengths" not in inspect.signature(post_process).parameters:
                 raise ValueError(f"focal_length: {type(self.processor).__name__} takes none")
-            options["focal_lengths"] = [focal_length]
-        output = self._forward(self.inputs([picture]), base)
+            options["focal_lengths"] = [focal_length] * len(sizes)
+        output = self._forward(pixel_values, base)
         if isinstance(output, torch.Tensor):
             output = SimpleNamespace(predicted_depth=output)
-        if not torch.isfinite(output.predicted_depth).all():
-            raise ValueError(f"{name}: the prediction has NaN or infinite values")
-        size = picture.height, picture.width
+        for name, depth in zip(names, output.predicted_depth, strict=True):
+            if not torch.isfinite(depth).all():
+                raise ValueError(f"{name}: the prediction has NaN or infinite values")
         if getattr(getattr(self.network, "config", None), "model_type", None) in RESIZED_HERE:
-            depth = nn.functional.interpolate(output.predicted_depth[None], size, mode="bicubic")
+            pairs = zip(output.predicted_depth[:, None, None], sizes, strict=True)
+            depths = [nn.functional.interpolate(own, tuple(size), mode="bicubic") for own, size in pairs]
         else:
-            depth = post_process(output, target_sizes=[size], **options)[0]["predicted_depth"]
-        return depth.float().cpu().numpy().reshape(size)  # transformers squeezes a side of one pixel away
+            depths = [own["predicted_depth"] for own in post_process(output, target_sizes=list(sizes), **options)]
+        # transformers squeezes a side of one pixel away
+        return [depth.float().cpu().numpy().reshape(size) for depth, size in zip(depths, sizes, strict=True)]
 
     def _predict(self, pixel_values: torch.Tensor, batch_size: int, base: bool, masked: bool = False) -> torch.Tensor:
         depths = []

@@ -22,7 +22,7 @@ from PIL import Image
 from torch import nn
 
 from gift_peft.files import reason
-from gift_peft.images import read_image
+from gift_peft.images import given_picture
 from gift_peft.models.adapter_base import check_base, find_base
 from gift_peft.models.identity import adapter_as_base, check_base_name
 from gift_peft.models.pixels import resolve_size, to_pixel_values
@@ -229,14 +229,7 @@ class DepthModel:
             FileNotFoundError: no such file.
             ValueError: no picture, NaN or infinity in the prediction, a focal length that the processor does not take.
         """
-        name = str(image) if isinstance(image, str | Path) else "the picture"
-        if isinstance(image, np.ndarray):
-            if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2 or not image.size:
-                raise ValueError(f"{name}: (H,W,3) uint8 is expected, not {image.shape} {image.dtype}")
-            image = Image.fromarray(image)
-        elif not isinstance(image, str | Path | Image.Image):
-            raise ValueError(f"{name}: a path, a PIL picture or a uint8 array is expected, not {type(image).__name__}")
-        picture = read_image(image, name)
+        picture, name = given_picture(image)
         return self.depths_of(self.inputs([picture]), [picture.size[::-1]], [name], focal_length, base)[0]
 
     def depths_of(

@@ -170,8 +170,7 @@ def test_signals_checkpoint_after_the_group_and_say_how_to_go_on(
             cli.main(["train", "--config", str(config)])
     assert exit.value.code == code
     assert signal.getsignal(signum) == before
-    command = capsys.readouterr().out.strip().splitlines()[-1].split()
-    assert command[:2] == ["gift-peft", "train"]
+    assert (command := capsys.readouterr().out.strip().splitlines()[-1].split())[:2] == ["gift-peft", "train"]
     assert checkpoints.checkpoint_fault(tmp_path / "out/checkpoint-3") is None
     with pytest.raises(SystemExit) as exit:
         cli.main(command[1:])

@@ -63,6 +63,7 @@ def _values(report: OrderingReport, key: str) -> list[str | Cell]:
     if report.base is None:
         return [value_cell(own)]
     base = report.base[key]
-    known = base is not None and own is not None and not math.isnan(base) and not math.isnan(own)
-    change = Cell(f"{own - base:+.4f}", (own - base,)) if known else Cell("-")
+    change = Cell("-")
+    if base is not None and own is not None and not math.isnan(base) and not math.isnan(own):
+        change = Cell(f"{own - base:+.4f}", (own - base,))
     return [value_cell(base), value_cell(own), change]

@@ -125,15 +125,15 @@ class DepthModel:
 
         if adapter is None and adapter_scale is not None:
             raise ValueError("adapter_scale needs an adapter")
-        if base is None and adapter is None:
+        if adapter is not None and not (base is not None and split_external(base)):
+            base, revision = find_base(base, adapter, revision)
+        if base is None:
             raise ValueError("a base model or an adapter is needed")
-        if base is not None and split_external(base):
+        if split_external(base):
             if adapter is not None:
                 raise ValueError(f"base {base}: an adapter needs a model of transformers")
             network, processor = load_external(base)
         else:
-            if adapter is not None:
-                base, revision = find_base(base, adapter, revision)
             network, processor = load_base(base, revision, with_processor=not _brings_processor(adapter))
         if adapter is None and Path(base).is_dir():  # a merged model says at what size it was trained
             merged = read_gift(base)
@@ -230,7 +230,7 @@ class DepthModel:
             ValueError: no picture, NaN or infinity in the prediction, a focal length that the processor does not take.
         """
         picture, name = given_picture(image)
-        return self.depths_of(self.inputs([picture]), [picture.size[::-1]], [name], focal_length, base)[0]
+        return self.depths_of(self.inputs([picture]), [(picture.height, picture.width)], [name], focal_length, base)[0]
 
     def depths_of(
         self,

@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
@@ -40,7 +41,7 @@ from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.loader import PreparedGroups
 from gift_peft.dataset.tensors import Group
 from gift_peft.group_inputs import GroupInputs
-from gift_peft.group_step import GroupStep
+from gift_peft.group_step import GroupStep, GroupStepOutput
 from gift_peft.models.loading import load_base
 from gift_peft.training import profiling
 from gift_peft.training.profiling import PHASES, Phases
@@ -86,6 +87,13 @@ class Bench:
             return GroupStep(self.model, micro_batch_size=num_images, retain=num_images, accelerator=self.accelerator)
         return {"a": self.pair, "b": self.replay, "d": self.step}[method]
 
+    def update(self, step: GroupStep, feed: Iterator[Group], phases: Phases) -> GroupStepOutput:
+        def load() -> GroupInputs:
+            group = next(feed)
+            return GroupInputs(group.pixel_values, group.mask, group.target, group.valid, group.names)
+
+        return profiling.timed_update(step, self.optimizer, load, phases)
+
     def time(self, method: str, size: int, max_pairs: int) -> Timing:
         """The updates of one group by one method; of (a) at most `max_pairs`, spread over the group."""
         phases = Phases(self.device)
@@ -93,7 +101,7 @@ class Bench:
         started = time.perf_counter()
         if method != "a":
             step = self.step_of(method, size)
-            output = profiling.timed_update(step, self.optimizer, lambda: inputs(next(feed)), phases)
+            output = self.update(step, feed, phases)
             return Timing(time.perf_counter() - started, phases.seconds, output.forwards, 1)
         with phases("load"):
             group = next(feed)
@@ -101,9 +109,7 @@ class Bench:
         pairs = pairs[:: max(1, len(pairs) // max_pairs)][:max_pairs]
         loading = dict(phases.seconds)
         for pair in pairs:
-            profiling.timed_update(
-                self.pair, self.optimizer, lambda pair=pair: inputs(pick(group, list(pair))), phases
-            )
+            self.update(self.pair, iter([pick(group, list(pair))]), phases)
         phases.seconds["load"] = loading["load"]  # picking two images is not loading
         return Timing(time.perf_counter() - started, phases.seconds, 2 * len(pairs), len(pairs))
 
@@ -113,10 +119,6 @@ def pick(group: Group, indices: list[int]) -> Group:
     valid = None if group.valid is None else group.valid[indices]
     names = [group.names[i] for i in indices]
     return Group(group.group_id, names, group.pixel_values[indices], group.mask[indices], valid, group.target[indices])
-
-
-def inputs(group: Group) -> GroupInputs:
-    return GroupInputs(group.pixel_values, group.mask, group.target, group.valid, group.names)
 
 
 def write_base(config: Config, folder: Path) -> None:
@@ -231,8 +233,6 @@ def measure_options(bench: Bench, size: int, repeats: int, compiled: bool) -> di
             seconds.append(time.perf_counter() - started)
         medians[name] = statistics.median(seconds[1:])
         del model, step
-        if bench.device.type == "cuda":
-            torch.cuda.empty_cache()
     return medians
 
 
@@ -252,9 +252,7 @@ def measure_memory(bench: Bench) -> dict:
             profiling.reset_peak_memory(bench.device)
             feed = bench.groups.take([bench.index[size]])
             try:
-                profiling.timed_update(
-                    step, bench.optimizer, lambda feed=feed: inputs(next(feed)), Phases(bench.device)
-                )
+                bench.update(step, feed, Phases(bench.device))
             except torch.OutOfMemoryError:
                 continue
             peaks[name][size] = profiling.peak_memory(bench.device) - before
@@ -279,7 +277,7 @@ def measure_scaling(bench: Bench, size: int, repeats: int) -> float:
     for _ in range(repeats + 1):
         bench.accelerator.wait_for_everyone()
         started = time.perf_counter()
-        profiling.timed_update(bench.step, bench.optimizer, lambda: inputs(next(feed)), Phases(bench.device))
+        bench.update(bench.step, feed, Phases(bench.device))
         seconds.append(time.perf_counter() - started)
     return statistics.median(seconds[1:])
 

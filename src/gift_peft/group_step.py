@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from gift_peft.group_inputs import GroupInputs, check_lambdas
 from gift_peft.losses import GiftLoss, gift_terms
 from gift_peft.memory import FrozenCasts, GraphBudget, is_out_of_memory, local_processes, release_memory
-from gift_peft.replayable import check_replayable, check_watched, watched
+from gift_peft.replayable import check_replayable, check_watched, mixed_precision_of, watched
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -56,8 +56,9 @@ class GroupStep:
         accelerator: its processes share the micro-batches, and its mixed precision ("no" or "bf16") is used. Without
             one: this process alone, bf16 for a model on CUDA, else no. See the attribute `mixed_precision`.
 
-    Attributes: `budget`, the `GraphBudget` of "auto", else None; `phase`, called with "snapshot", "loss", "replay" and
-    "reduce" for a context around each part of a step, to time it.
+    Attributes: `budget`, the `GraphBudget` of "auto", else None; `first_share`, the distillation's part (0-dim, 0 to
+    1) in the pull on the first group's predictions, which for a fresh adapter is all rounding; `phase`, called with
+    "snapshot", "loss", "replay" and "reduce" for a context around each part of a step, to time it.
     Raises ValueError for fp16, active dropout settings, a wrapped or sharded model and arguments out of range.
     """
 
@@ -87,7 +88,7 @@ class GroupStep:
         self.micro_batch_size = micro_batch_size
         self.retain = retain
         self.accelerator: Any = accelerator  # accelerate does not say that `reduce` of a tensor is a tensor
-        self.mixed_precision = _mixed_precision(model, accelerator)
+        self.mixed_precision = mixed_precision_of(model, accelerator)
         self.phase: Callable[[str], AbstractContextManager] = nullcontext
         self._rank = accelerator.process_index if accelerator else 0
         self._world = accelerator.num_processes if accelerator else 1
@@ -95,6 +96,7 @@ class GroupStep:
         budget = GraphBudget(model, local_processes(self._world), self._casts)
         self.budget = budget if retain == "auto" or micro_batch_size == "auto" else None
         self._parameters = list(model.parameters())
+        self.first_share: Tensor | None = None
         self._watched = None  # what must not change between a snapshot and its replay: found with the first group
         self._sizes: dict[tuple[int, ...], tuple[int, int]] = {}  # of predictions, by the shape of an image
         self._shared: set[tuple[int, ...]] = set()  # of those shapes the ones that all processes know the size of
@@ -156,15 +158,18 @@ class GroupStep:
         """Images per forward that memory allows: even or 1, at most 8 on CUDA; the least of all processes.
 
         Measured with one forward of two images of a group, or of one where two are too many. `largest` is how many
-        images the largest group has: more are never asked for. Raises as PyTorch where not even one fits.
+        images the largest group has: more are never asked for. Raises torch.OutOfMemoryError, on all processes, where
+        not even one fits.
         """
         budget = self.budget or GraphBudget(self.model, local_processes(self._world), self._casts)
         with self._casts or nullcontext(), torch.enable_grad():
             count = budget.measure_few(group.pixel_values, self._predict)
         canvas = self._canvas(group, "meta")[:1].expand(largest or len(group), -1, -1)
-        chosen = 1 if count < min(2, len(group)) else budget.widen(group.pixel_values, count, canvas)
+        chosen = count if count < min(2, len(group)) else budget.widen(group.pixel_values, count, canvas)
         if self._world > 1:
             chosen = int(self.accelerator.gather(torch.tensor([chosen], device=self._parameters[0].device)).min())
+        if chosen == 0:
+            raise torch.OutOfMemoryError("not even one image fits into memory")
         budget.reserve(group.pixel_values, count, chosen, canvas)
         return chosen
 
@@ -267,6 +272,10 @@ class GroupStep:
         with torch.enable_grad():
             leaf = canvas.detach().requires_grad_()
             loss = gift_terms(leaf, target, mask, group.pairs, self.lambda_c, self.lambda_d, valid)
+            if self.first_share is None:
+                terms = (self.lambda_c * loss.consistency, self.lambda_d * loss.distillation)
+                pulls = [torch.autograd.grad(term, leaf, retain_graph=True)[0].abs().sum() for term in terms]
+                self.first_share = pulls[1] / sum(pulls).clamp(min=torch.finfo(leaf.dtype).tiny)
             (gradient,) = torch.autograd.grad(loss.total, leaf)
         terms = loss.total.detach(), loss.consistency.detach(), loss.distillation.detach()
         return GiftLoss(*terms, loss.num_pairs), gradient
@@ -382,15 +391,3 @@ class GroupStep:
         if prediction.ndim != 3 or len(prediction) != len(pixel_values):
             raise ValueError(f"the model must predict ({len(pixel_values)},H,W), got {tuple(prediction.shape)}")
         return prediction
-
-
-def _mixed_precision(model: nn.Module, accelerator: Accelerator | None) -> str:
-    if accelerator is not None:
-        precision = accelerator.mixed_precision
-    else:
-        precision = "bf16" if next(model.parameters()).device.type == "cuda" else "no"
-    if precision not in ("no", "bf16"):
-        raise ValueError(
-            f"mixed precision {precision} is not supported (a gradient scaler cannot follow a replay): use bf16 or no"
-        )
-    return precision

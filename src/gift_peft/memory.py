@@ -88,20 +88,16 @@ class GraphBudget:
         return prediction
 
     def measure_few(self, pixel_values: Tensor, forward: Callable[[Tensor], Tensor]) -> int:
-        """`measure` with two images, or one where two are too many; returns how many these were.
-
-        Nothing is kept. Raises what PyTorch raises where not even one fits.
-        """
-        count = min(2, len(pixel_values))
-        while True:
+        """`measure` with two images, or one where two are too many; returns how many these were, 0 if not one fits."""
+        for count in range(min(2, len(pixel_values)), 0, -1):
             try:
                 self.measure(pixel_values[:count], forward)
                 return count
             except RuntimeError as error:
-                if count == 1 or not is_out_of_memory(error):
+                if not is_out_of_memory(error):
                     raise
-            count = 1
             release_memory(next(self._model.parameters()).device)
+        return 0
 
     def images(self, pixel_values: Tensor, canvas: Tensor) -> int:
         """How many of these images' graphs may be kept, beside their predictions `canvas` (N,H,W)."""

@@ -5,6 +5,7 @@ was found is looked at for every group.
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 from torch import nn
 
@@ -46,3 +47,16 @@ def check_watched(name: str, module: nn.Module, key: str) -> None:
 def _rate(module: nn.Module, key: str) -> float:
     rate = getattr(module, key, 0)
     return rate if isinstance(rate, int | float) else 0
+
+
+def mixed_precision_of(model: nn.Module, accelerator: Any) -> str:
+    """ "no" or "bf16": the accelerator's, or without one bf16 on CUDA; ValueError for another."""
+    if accelerator is not None:
+        precision = accelerator.mixed_precision
+    else:
+        precision = "bf16" if next(model.parameters()).device.type == "cuda" else "no"
+    if precision not in ("no", "bf16"):
+        raise ValueError(
+            f"mixed precision {precision} is not supported (a gradient scaler cannot follow a replay): use bf16 or no"
+        )
+    return precision

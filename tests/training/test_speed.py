@@ -1,12 +1,14 @@
 """What makes a step faster or smaller: the same gradient, and where not, how near."""
 
+from functools import partial
+
 import pytest
 import torch
 from helpers.group_tools import SIZE, gift_model, gradients, group, largest_error, step_gradients
 from torch import nn
 
 from gift_peft.adapters.recipes import get_gift_model
-from gift_peft.memory import graph_bytes
+from gift_peft.memory import graph_bytes, is_compiled
 from gift_peft.training.speed import checkpoint_blocks, compile_blocks, encoder_blocks, make_adam, use_channels_last
 
 
@@ -101,6 +103,36 @@ def test_compiled_blocks_give_the_same_gradient(dtype, tolerance):
         assert relative_l2(got, want) < tolerance
     assert [name for name, _ in model.named_parameters()] == names
     assert gradients(model).keys() == want.keys()
+
+
+def test_compiled_blocks_are_one_graph_with_the_same_bits_for_batches_of_any_size(monkeypatch):
+    """Without code generation (aot_eager): what Dynamo sees is the point."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
+    model = gift_model(torch.float32)
+    names = [name for name, _ in model.named_parameters()]
+    batches = {count: group(count, torch.float32)[0] for count in (2, 3, 1, 4, 5, 7, 9)}
+
+    def predict(pixels):
+        with torch.no_grad():
+            exact = model(pixel_values=pixels).predicted_depth
+        with torch.autocast("cpu", torch.bfloat16):
+            return exact, model(pixel_values=pixels).predicted_depth.detach()
+
+    want = {count: predict(pixels) for count, pixels in batches.items()}
+    torch._dynamo.reset()
+    counters = torch._dynamo.utils.counters
+    counters.clear()
+    compile_blocks(model)
+    graphs = []
+    for count, pixels in batches.items():
+        for got, expected in zip(predict(pixels), want[count], strict=True):
+            assert torch.equal(got, expected)
+        graphs.append(counters["stats"]["unique_graphs"])
+    assert not counters["graph_break"]
+    assert graphs[0] >= 2 and graphs[2:] == [graphs[2]] * 5  # after two sizes and a single image none is added
+    assert [name for name, _ in model.named_parameters()] == names
+    assert all(is_compiled(block) for block in encoder_blocks(model))
+    torch._dynamo.reset()
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-3)])

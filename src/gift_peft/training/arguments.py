@@ -173,8 +173,8 @@ class GiftTrainingArguments:
     adam_epsilon: float = _arg("Adam's epsilon", 1e-8)
     weight_decay: float = _arg("Adam's weight decay", 0.0)
     mixed_precision: Literal["no", "bf16", "fp16"] | None = _arg(
-        "autocast; default: accelerate's setting, else bf16 on CUDA from compute capability 8.0 on, no elsewhere; fp16 is "
-        "refused",
+        "autocast; default: accelerate's setting, else bf16 on CUDA (compute capability 8.0 and newer) and no "
+        "elsewhere; fp16 is refused",
         None,
     )
     seed: int = _arg("seed of the LoRA initialisation and of the order of the groups", 0)

@@ -23,8 +23,8 @@ from gift_peft.dataset.cache import default_cache_dir
 from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.loader import PreparedGroups
 from gift_peft.dataset.proxies import proxies_command
-from gift_peft.models.identity import weights_revision
 from gift_peft.memory import is_out_of_memory
+from gift_peft.models.identity import weights_revision
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.models.pixels import resolve_size
 from gift_peft.reports.model_card import model_card
@@ -298,7 +298,7 @@ def _fit(
             if schedule.checkpoint_is_due(state.step) and not schedule.row_is_due(state):
                 save_checkpoint()
             progress.step(losses.total, losses.consistency)
-            if state.step == first and (note := objective.memory_note()):
+            if state.step == first and (note := objective.first_note(fresh=first == 1)):
                 progress.say(note)
         if signum:
             save_checkpoint()

@@ -132,9 +132,16 @@ class Consensus:
 
         return look_at_all(self.groups, self._read, look, self.accelerator, quiet)
 
-    def memory_note(self) -> str:
-        """What the first update has taught about memory; empty where nothing."""
-        return "" if self.step.budget is None else str(self.step.budget)
+    def first_note(self, fresh: bool) -> str:
+        """What the first update has taught: of memory and, in a `fresh` run, of rounding; empty where nothing."""
+        notes = [] if self.step.budget is None else [str(self.step.budget)]
+        share = float(self.step.first_share or 0)
+        if fresh and share > 0:
+            notes.append(
+                f"Rounding ({self.step.mixed_precision}) is {share:.0%} of the first update's pull, as distillation "
+                "from proxies in float32; it shrinks once the predictions have moved"
+            )
+        return "\n".join(notes)
 
 
 class Share(NamedTuple):
@@ -224,7 +231,7 @@ class Surface:
 
         return look_at_all(self.groups, self.groups.__getitem__, look, self.accelerator, quiet)
 
-    def memory_note(self) -> str:
+    def first_note(self, fresh: bool) -> str:
         """Nothing: what does not fit is halved when it turns out."""
         return ""
 

@@ -35,20 +35,24 @@ def exact_output(model: nn.Module) -> None:
     """Leave convolutions that give depth itself, one channel, in float32 under autocast; else nothing changes."""
     for module in model.modules():
         if isinstance(module, nn.Conv2d) and module.out_channels == 1:
-            module.register_forward_pre_hook(_leave_autocast)
-            module.register_forward_hook(_enter_autocast, always_call=True)
+            hooks = _OutOfAutocast()
+            module.register_forward_pre_hook(hooks.leave)
+            module.register_forward_hook(hooks.enter, always_call=True)
 
 
-def _leave_autocast(module: nn.Module, args: tuple) -> tuple | None:
-    device = args[0].device.type
-    if not torch.is_autocast_enabled(device):
-        return None
-    module._left_autocast = device
-    torch.set_autocast_enabled(device, False)
-    return args[0].float(), *args[1:]
+class _OutOfAutocast:
+    """One module's forward without autocast, on inputs in float32."""
 
+    def __init__(self) -> None:
+        self.left = False
 
-def _enter_autocast(module: nn.Module, args: tuple, output: Any) -> None:
-    device = module.__dict__.pop("_left_autocast", None)
-    if device is not None:
-        torch.set_autocast_enabled(device, True)
+    def leave(self, module: nn.Module, args: tuple) -> tuple | None:
+        self.left = torch.is_autocast_enabled(args[0].device.type)
+        if not self.left:
+            return None
+        torch.set_autocast_enabled(args[0].device.type, False)
+        return args[0].float(), *args[1:]
+
+    def enter(self, module: nn.Module, args: tuple, output: Any) -> None:
+        if self.left:
+            torch.set_autocast_enabled(args[0].device.type, True)

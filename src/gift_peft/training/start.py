@@ -126,7 +126,7 @@ def agree(signum: int, accelerator: Accelerator) -> int:
     """The signal to stop by, if any process has received one, on all of them."""
     if accelerator.num_processes == 1:
         return signum
-    received = accelerator.gather(torch.tensor([signum], device=accelerator.device))
+    received = accelerator.gather(torch.full((1,), signum, device=accelerator.device))
     return int(received.max())
 
 

@@ -1,8 +1,9 @@
 """The teacher: the frozen base model, asked once for every image before training starts (paper section 4, proxies).
 
 Proxies are float32, without TF32. Where training is too, the self-distillation of a model whose adapter is still zero
-is exactly zero, however both are cut into batches: the losses take differences of rounding for none. Surface targets are computed from the
-proxies, and from what the teacher predicts for the flipped photos and for fills (surface_targets.py).
+is exactly zero, however both are cut into batches: the losses take differences of rounding for none. Surface targets
+are computed from the proxies, and from what the teacher predicts for the flipped photos and for fills
+(surface_targets.py).
 """
 
 from collections.abc import Sequence

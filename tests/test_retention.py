@@ -242,7 +242,8 @@ def test_the_largest_group_decides_and_the_choice_stays(monkeypatch):
     step = with_room(6, model, group(9, torch.float32), monkeypatch)
     assert step.choose_micro_batch_size(GroupInputs(*data), largest=9) < 6
     step = with_room(100, model, data, monkeypatch)
-    assert step.choose_micro_batch_size(GroupInputs(*data), largest=9) == 9
+    assert step.choose_micro_batch_size(GroupInputs(*data), largest=9) == step.micro_batch_size == 9
+    step = with_room(100, model, data, monkeypatch)
     assert (step.accumulate(*data).forwards, step.micro_batch_size) == (4, 4)
     step.accumulate(*group(9, torch.float32))
     assert step.micro_batch_size == 4

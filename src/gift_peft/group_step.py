@@ -132,7 +132,7 @@ class GroupStep:
             raise ValueError("fp16 parameters cannot be trained: load the base in float32")
         self._check_size(group)
         if self.micro_batch_size == "auto":
-            self.micro_batch_size = self.choose_micro_batch_size(group)
+            self.choose_micro_batch_size(group)
         device = parameters[0].device
         mask, target = (part.to(device, non_blocking=True) for part in (group.mask, group.target))
         valid = None if group.valid is None else group.valid.to(device, non_blocking=True)
@@ -155,9 +155,9 @@ class GroupStep:
         return GroupStepOutput(*cpu, num_pairs=loss.num_pairs, forwards=2 * len(mask) - int(kept))
 
     def choose_micro_batch_size(self, group: GroupInputs, largest: int | None = None) -> int:
-        """Images per forward that memory allows: even or 1, at most 8 on CUDA; the least of all processes.
+        """Set and return the images per forward that memory allows, the least of all processes; at most 8 on CUDA.
 
-        Measured with one forward of two images of a group, or of one where two are too many. `largest` is how many
+        The whole of the largest group, else an even number or 1. Measured with one forward of two images of a group, or of one where two are too many. `largest` is how many
         images the largest group has: more are never asked for. Raises torch.OutOfMemoryError, on all processes, where
         not even one fits.
         """
@@ -171,6 +171,7 @@ class GroupStep:
         if chosen == 0:
             raise torch.OutOfMemoryError("not even one image fits into memory")
         budget.reserve(group.pixel_values, count, chosen, canvas)
+        self.micro_batch_size = chosen
         return chosen
 
     def _check_model(self) -> None:

@@ -1,5 +1,6 @@
 """`DepthModel`: what `predict` writes is what transformers' pipeline gives, whatever the backbone; pictures; kinds."""
 
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,11 +9,13 @@ import torch
 from helpers.backbones import picture, tiny_metric3d, tiny_vggt
 from helpers.tiny import SIZE, tiny_model, tiny_processor
 from PIL import Image
+from safetensors.torch import load_file
 from transformers import pipeline
 
 from gift_peft import DepthModel
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import get_gift_model
+from gift_peft.models.loading import load_base
 from gift_peft.models.metric3d.image_processing_metric3d import Metric3DImageProcessorPil
 from gift_peft.models.vggt.image_processing_vggt import VggtImageProcessorPil
 from gift_peft.predict import predict_images

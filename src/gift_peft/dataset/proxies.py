@@ -302,8 +302,8 @@ class ProxyStore:
             for label, values in zip(labels, tensor if name in columns else [tensor], strict=False):
                 if not values.isfinite().all():
                     raise ValueError(f"NaN or infinite values in {what} {path} ({label}); {again}")
-        for name, digests in header.get("values", {}).items():  # files of 0.1.0 have none
-            stated = digests[part] if name in columns else digests
+        for name, stated in header.get("values", {}).items():  # files of 0.1.0 have none
+            stated = stated[part] if name in columns else stated
             if name in tensors and stated != [_digest(values) for values in _entries(tensors[name])]:
                 raise ValueError(f"damaged {what} {path} (values of {name} have changed since it was made); {again}")
         if changed := difference(header, {**self.expected, **digests}, names):

@@ -157,9 +157,9 @@ class GroupStep:
     def choose_micro_batch_size(self, group: GroupInputs, largest: int | None = None) -> int:
         """Set and return the images per forward that memory allows, the least of all processes; at most 8 on CUDA.
 
-        The whole of the largest group, else an even number or 1. Measured with one forward of two images of a group, or of one where two are too many. `largest` is how many
-        images the largest group has: more are never asked for. Raises torch.OutOfMemoryError, on all processes, where
-        not even one fits.
+        The whole of the largest group, of `largest` images (default: this one), else an even number or 1. Measured
+        with one forward of two images, or of one where two are too many. Raises torch.OutOfMemoryError, on all
+        processes, where not even one fits.
         """
         budget = self.budget or GraphBudget(self.model, local_processes(self._world), self._casts)
         with self._casts or nullcontext(), torch.enable_grad():

@@ -9,7 +9,14 @@ from torch import nn
 
 from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.memory import graph_bytes, is_compiled
-from gift_peft.training.speed import checkpoint_blocks, compile_blocks, encoder_blocks, make_adam, use_channels_last
+from gift_peft.training.speed import (
+    checkpoint_blocks,
+    compile_blocks,
+    encoder_blocks,
+    make_adam,
+    tuned_for,
+    use_channels_last,
+)
 
 
 def relative_l2(got, want):
@@ -64,6 +71,23 @@ def test_channels_last_changes_the_trained_head_only():
     assert all(got[name].is_contiguous() for name in got)
     with torch.no_grad(), model.disable_adapter():
         assert torch.equal(model(pixel_values=data[0]).predicted_depth, teacher)
+
+
+@pytest.mark.parametrize(
+    ("device", "asked", "head", "expected"),
+    [
+        ("cpu", None, "full", False),
+        ("cpu", True, "full", True),
+        ("cuda", None, "full", True),
+        ("cuda", None, "lora", False),
+        ("cuda", False, "full", False),
+        ("cuda", True, "lora", True),  # refused when the model is made
+    ],
+)
+def test_channels_last_by_device(device, asked, head, expected, monkeypatch):
+    monkeypatch.setattr(torch.backends.cudnn, "benchmark", False)
+    assert tuned_for(torch.device(device), asked, head) is expected
+    assert torch.backends.cudnn.benchmark is (device == "cuda")
 
 
 def test_channels_last_wants_a_head_that_is_trained(model):

@@ -161,7 +161,9 @@ class GiftTrainingArguments:
         "recompute the blocks in the backward; smaller graphs, more are retained", False
     )
     compile: bool = _arg("torch.compile the encoder's blocks; changes the bits", False)
-    channels_last: bool = _arg("the head's convolutions in channels-last layout; changes the bits", False)
+    channels_last: bool | None = _arg(
+        "the head's convolutions in channels-last layout; changes the bits; default: on CUDA, with head: full", None
+    )
     num_train_epochs: int = _arg("passes over the groups (one update per group) or, for surface, their images", 50)
     max_steps: int = _arg("stop after this many updates; -1: num_train_epochs decides", -1)
     learning_rate: float = _arg("Adam's learning rate at the first update", 2e-5)

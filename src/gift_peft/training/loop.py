@@ -37,7 +37,7 @@ from gift_peft.training.precision import exact_output
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress, how_to_resume, summary
 from gift_peft.training.schedule import Schedule
-from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
+from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, tuned_for, use_channels_last
 from gift_peft.training.start import (
     Interrupted,
     agree,
@@ -94,6 +94,7 @@ def train(args: GiftTrainingArguments | None = None, **arguments: Any) -> TrainR
 def _train(args: GiftTrainingArguments, accelerator: Accelerator) -> TrainResult:
     # check: what can be known to fail fails before a model is loaded
     output, checkpoint = check_run(args, accelerator)
+    args = replace(args, channels_last=tuned_for(accelerator.device, args.channels_last, args.head))
 
     # load: float32 weights whatever the checkpoint's, bf16 is autocast's business (paper, implementation details)
     base, processor = load_base(args.model_name_or_path, args.model_revision)

@@ -19,7 +19,7 @@ from gift_peft.dataset.loader import PreparedGroups, PreparedImages, epoch_flips
 from gift_peft.dataset.tensors import Group
 from gift_peft.group_inputs import GroupInputs
 from gift_peft.group_step import GroupStep
-from gift_peft.losses import Pairs, gift_terms, masked_l1
+from gift_peft.losses import gift_terms, masked_l1
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.mask_checks import check_surroundings, warn_of_masks
 from gift_peft.training.schedule import updates_after
@@ -101,11 +101,8 @@ class Consensus:
     def _read(self, index: int) -> Loaded:
         """A group, checked and with its pairs found, in a thread that loads it."""
         group = self.groups[index]
-        pairs = Pairs.of(group.mask, group.valid)
-        if self.groups.pin:
-            pairs = pairs.pin_memory()
-        tensors = (group.pixel_values, group.mask, group.target, group.valid)
-        return Loaded(group.group_id, GroupInputs(*tensors, group.names, pairs))
+        inputs = GroupInputs(group.pixel_values, group.mask, group.target, group.valid, group.names)
+        return Loaded(group.group_id, inputs.pin_memory() if self.groups.pin else inputs)
 
     def accumulate(self, group: Loaded) -> Losses:
         output = self.step.accumulate_inputs(group.inputs)

@@ -85,6 +85,16 @@ def checkpoint_blocks(model: PeftModel) -> None:
         block.training = True
 
 
+def tuned_for(device: torch.device, channels_last: bool | None, head: str) -> bool:
+    """Whether the head's convolutions run in channels-last layout: as asked, else on CUDA, where bf16 ones want it.
+
+    On CUDA cuDNN also tries its algorithms out from now on; a run has images of one or two sizes.
+    """
+    if device.type == "cuda":
+        torch.backends.cudnn.benchmark = True
+    return device.type == "cuda" and head == "full" if channels_last is None else channels_last
+
+
 def use_channels_last(model: PeftModel) -> None:
     """Hand each convolution of the trained head its input in channels-last layout, which the rest then follows.
 

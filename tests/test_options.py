@@ -143,7 +143,7 @@ def test_the_home_folder_is_written_out_in_every_option(parser, monkeypatch, tmp
         value = vars(parser.parse_args([f"{option}=~/x y"]))[action.dest]
         assert value in (f"{tmp_path}/x y", [f"{tmp_path}/x y"], Path(f"{tmp_path}/x y")), option
         tried += 1
-    assert tried
+    assert tried or parser.prog == "gift-peft synthesize"  # which has numbers alone
 
 
 def test_only_a_leading_tilde_is_the_home_folder(monkeypatch):

@@ -215,6 +215,13 @@ def test_a_renamed_run_finds_its_base_and_no_wrong_one(place):
         DepthModel.from_pretrained()
 
 
+def test_a_run_or_a_file_in_the_place_of_an_adapter_is_told(place):
+    with pytest.raises(FileNotFoundError, match=rf"this is a run, whose adapter is {place}/adapter"):
+        DepthModel.from_pretrained(place / "base", place)
+    with pytest.raises(FileNotFoundError, match=rf"name the folder, {place}/adapter, not a file in it"):
+        DepthModel.from_pretrained(place / "base", place / "adapter/adapter_model.safetensors")
+
+
 def test_an_adapter_in_the_place_of_a_base_says_what_to_do(place):
     for folder in (place / "adapter", shutil.copytree(place / "base", place / "both")):
         if folder.name == "both":

@@ -337,33 +337,3 @@ def test_booster_has_its_own_tables_and_pictures(run_folder, base_dir, tmp_path,
     shutil.rmtree(tmp_path / "booster")
     run_report([run_folder])
     assert "not in it: pictures of" in capsys.readouterr().out
-
-
-def test_a_report_keeps_what_no_report_wrote(run_folder, tmp_path):
-    for name in ("report.md", "tables/mine.csv", "holiday.png", "model_card.md"):
-        out = tmp_path / name.replace("/", "-")
-        (out / name).parent.mkdir(parents=True)
-        (out / name).write_text("mine")
-        with pytest.raises(ValueError, match=rf"has {name.partition('/')[0]}, which no report wrote"):
-            run_report([run_folder], out, panels=0)
-        assert [path.read_text() for path in out.rglob("*") if path.is_file()] == ["mine"]
-    out = tmp_path / "reports"
-    (out / "sub").mkdir(parents=True)
-    (out / "sub/holiday.png").write_text("mine")
-    for _ in range(2):
-        run_report([run_folder], out, panels=0)
-    assert (out / "sub/holiday.png").read_text() == "mine" and "Not finished" not in (out / "report.md").read_text()
-    shutil.copy(ROOT / "README.md", out / "zero-shot-my-run.png")
-    with pytest.raises(ValueError, match=r"zero-shot-my-run\.png would replace the input"):
-        run_report([run_folder], out, panels=0, zero_shot=[out / "zero-shot-my-run.png"])
-    plan = tmp_path / "plan.yaml"
-    shutil.copy(run_folder / "config.yaml", plan)
-    with pytest.raises(ValueError, match="would replace the input"):
-        run_report([plan], card=plan)
-
-
-def test_an_evaluation_keeps_what_no_evaluation_wrote(trained, base_dir, tree, tmp_path):
-    (tmp_path / "report.md").write_text("mine")
-    with pytest.raises(ValueError, match=r"its report\.md is of no evaluation and is kept"):
-        run_evaluation(base_dir, tree, trained / "adapter", out=tmp_path)
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]

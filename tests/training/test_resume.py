@@ -120,6 +120,7 @@ def test_interrupted_twice_the_last_checkpoint_is_the_same_to_the_byte(args, who
 def test_a_checkpoint_that_pins_the_files_of_its_base_goes_on(args, whole, base_dir, tmp_path):
     """As 0.1.0 wrote them."""
     out = shutil.copytree(whole, tmp_path / "out", ignore=shutil.ignore_patterns("checkpoint-4", "adapter-last"))
+    assert (out / "checkpoint-3").is_dir()
 
     def pin(revision):
         folder = out / "checkpoint-3"

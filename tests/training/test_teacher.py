@@ -175,7 +175,7 @@ def test_kill_leaves_no_broken_file(raw_tree, base_dir, tmp_path, moment):
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL
-    folder = raw_tree / "proxies" / teacher_id(base_dir)
+    folder = raw_tree / "proxies" / teacher_id(base_dir) / "56x70"
     left = files(folder)
     assert len(left) == 1 and left.items() <= whole.items()
     assert len(list(folder.rglob(".*.partial"))) == 1
@@ -200,9 +200,9 @@ def test_two_processes_make_the_same_files(base_dir, tmp_path):
     raw = write_raw_tree(tmp_path / "raw", train=(2, 3, 5), validation=(1, 2))
     alone = make_proxies(base_dir, raw, size=SIZE, proxies_dir=tmp_path / "one")
     debug_launcher(_make_in_two, (base_dir, raw, tmp_path / "two"), num_processes=2)
-    assert files(tmp_path / "two" / alone.name) == files(alone) and len(files(alone)) == 5
+    assert files(tmp_path / "two" / teacher_id(base_dir) / "56x70") == files(alone) and len(files(alone)) == 5
     # What one process stumbles over, all report, and none is left waiting.
-    stale = tmp_path / "two" / alone.name / "train" / "scene_1.safetensors"
+    stale = tmp_path / "two" / teacher_id(base_dir) / "56x70" / "train" / "scene_1.safetensors"
     Image.new("RGB", (80, 60)).save(raw / "train/scene_1/0.png")
     (tmp_path / "seen").mkdir()
     debug_launcher(_fail_in_two, (base_dir, raw, tmp_path / "two", tmp_path / "seen"), num_processes=2)

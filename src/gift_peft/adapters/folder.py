@@ -146,10 +146,14 @@ def read_adapter_config(adapter: str | Path) -> LoraConfig:
     Raises FileNotFoundError if there is none or, in a folder, no `adapter_model.safetensors` beside it (pickles are
     not read), ValueError naming file and field for what is no LoRA configuration.
     """
+    if Path(adapter).is_file():
+        raise FileNotFoundError(f"adapter {adapter}: name the folder, {Path(adapter).parent}, not a file in it")
     if Path(adapter).is_dir():
         for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS):
             if not (Path(adapter) / name).is_file():
-                raise FileNotFoundError(f"adapter {adapter}: the folder has no {name}")
+                inside = Path(adapter) / "adapter"
+                hint = f"; this is a run, whose adapter is {inside}" if (inside / name).is_file() else ""
+                raise FileNotFoundError(f"adapter {adapter}: the folder has no {name}{hint}")
         _read_object(adapter, ADAPTER_CONFIG)
     where = f"adapter {adapter}: damaged {ADAPTER_CONFIG}"
     try:

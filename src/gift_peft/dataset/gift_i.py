@@ -39,6 +39,7 @@ from gift_peft.dataset.rows import IMAGE_COLUMNS, RowRules
 from gift_peft.files import is_hub_id, reason
 from gift_peft.images import image_digest, natural_key
 from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
+from gift_peft.models.pixels import pixel_settings
 from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
 
 FEATURES = Features(
@@ -159,8 +160,8 @@ def load_gift_i(
         identity = teacher_id(teacher, revision)
         proxies = Path(proxies_dir) if proxies_dir else default_proxies_dir(path, identity)
         expected = {"format": FORMAT, "teacher": identity, "revision": teacher_revision(teacher, revision)}
-        if has_earlier_set(proxies / identity) and Path(teacher).is_dir():
-            expected[EARLIER] = earlier_revision(teacher)
+        if Path(teacher).is_dir():  # of a hub id the commit pins all
+            expected |= _expected_of_folder(teacher, has_earlier_set(proxies / identity))
         wanted = None if size is None else f"{size[0]}x{size[1]}"
         sizes = [wanted] if wanted else sorted(stored_sizes(proxies / identity, name))
         if len(sizes) > 1:
@@ -172,6 +173,16 @@ def load_gift_i(
         if surface is not None:
             rules = replace(rules, surface=SurfaceStore(*place, expected | surface.header(), command(surface)))
     return rules.apply(dataset)
+
+
+def _expected_of_folder(teacher: str | Path, earlier: bool) -> dict:
+    """What a proxy's header says of a teacher's folder besides its weights."""
+    from gift_peft.models.loading import load_processor
+
+    found = {EARLIER: earlier_revision(teacher)} if earlier else {}
+    if (Path(teacher) / "preprocessor_config.json").is_file():
+        found["processor"] = pixel_settings(load_processor(teacher))
+    return found
 
 
 def gift_i_splits(path: str | Path) -> list[str]:

@@ -38,10 +38,16 @@ SURFACE_FORMAT = "gift-peft surface targets 1"
 METADATA = "gift_peft"
 SURFACE_SUFFIX = ".surface"
 EARLIER = "earlier_revision"  # expected of files of 0.1.0 in place of the revision; never written
+TOLD = "told"  # of a surface target's header: what `evaluation.surface_check.describe` knows; never compared
 # What a header says apart from pixels, in the order in which differences are told, and in words where those differ.
 STATED = ("format", "teacher", "revision", "size", "processor", "kind", "rule")
 STATED += ("fills", "seed", "surface_model", "surface_quantile", "surface_tau")
 IN_WORDS = {"revision": "model or revision", "processor": "image processor"}
+# Whether there are fills: measured in docs/surface-targets.md.
+LEVELS = {
+    True: {"surface_quantile": 0.65, "surface_tau": 0.5},
+    False: {"surface_quantile": 0.8, "surface_tau": 0.7},
+}
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,8 @@ class SurfaceSettings:
         fills (`int`): copies of each photo with its target painted, predicted beside it; 0 is allowed.
         seed (`int`): of the fills' colors.
         surface_model (`str`): "auto", "plane" or "quantile", as `surface_target` takes it.
-        surface_quantile, surface_tau (`float`): levels of the two models; higher is nearer.
+        surface_quantile, surface_tau (`float`, *optional*): levels of the two models; higher is nearer. Default 0.65
+            and 0.5 with fills, which show the surface; 0.8 and 0.7 without, where what lies behind has most votes.
 
     Raises:
         ValueError: a value out of range.
@@ -61,14 +68,17 @@ class SurfaceSettings:
     fills: int = 6
     seed: int = 0
     surface_model: str = "auto"
-    surface_quantile: float = 0.8
-    surface_tau: float = 0.7
+    surface_quantile: float | None = None
+    surface_tau: float | None = None
 
     def __post_init__(self) -> None:
         if self.fills < 0 or self.seed < 0:
             raise ValueError(f"fills and seed: must not be negative, got {self.fills} and {self.seed}")
         if self.surface_model not in MODELS:
             raise ValueError(f"surface_model {self.surface_model!r}: it is one of {', '.join(MODELS)}")
+        for name, level in LEVELS[self.fills > 0].items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, level)  # the only way in a frozen dataclass
         if not 0 <= self.surface_quantile <= 1:
             raise ValueError(f"surface_quantile: must lie from 0 to 1, got {self.surface_quantile}")
         if not 0 < self.surface_tau < 1:
@@ -110,9 +120,11 @@ def proxies_command(
     }
     if surface is not None:
         options["--target"] = "surface"
+        defaults = SurfaceSettings(surface.fills)
         for field in fields(surface):
             value = getattr(surface, field.name)
-            options[f"--{field.name}"] = None if value == field.default else value
+            default = field.default if field.name == "fills" else getattr(defaults, field.name)
+            options[f"--{field.name}"] = None if value == default else value
     given = [part for option, value in options.items() if value is not None for part in (option, str(value))]
     return shlex.join(["gift-peft", "proxies", *given])
 

@@ -25,7 +25,7 @@ IMAGE_COLUMNS = ("images", "masks", "valids", "depths")
 
 @dataclass(frozen=True)
 class RowRules:
-    """How rows are read. Unpickling a dataset elsewhere imports this module, and with it the formatter.
+    """How rows are read.
 
     Args:
         train (`bool`): some mask of a group must have a target.
@@ -52,8 +52,15 @@ class RowRules:
         return cls(**{**stated, **found})
 
     def apply(self, rows: datasets.Dataset) -> datasets.Dataset:
-        """The rows, read under these rules; stated in JSON types, or `Dataset.save_to_disk` could not write them."""
-        return rows.with_format(FORMAT_TYPE, rules=asdict(self))
+        """The rows, read under these rules."""
+        return rows.with_format(FORMAT_TYPE, rules=StatedRules(asdict(self)))
+
+
+class StatedRules(dict):
+    """Rules in JSON types, or `Dataset.save_to_disk` could not write them.
+
+    Unpickling a dataset elsewhere imports this module for it, and with it the formatter.
+    """
 
 
 def parsed(rows: Any) -> Any:

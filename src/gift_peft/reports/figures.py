@@ -109,14 +109,18 @@ def before_after(
     return save_grid([panel_row(panel) for panel in rows], columns, path)
 
 
-def panel_row(panel: Panel) -> GridRow:
-    """RGB, reference, base and adapted of one panel as coloured tiles."""
-    aligned = align_panel(panel)
-    maps = (aligned.reference, aligned.base, aligned.adapted)
+def panel_row(panel: Panel, *others: Panel) -> GridRow:
+    """RGB, reference, base and adapted of one panel as coloured tiles.
+
+    `others`: the same picture, reference and base with other adapted predictions, each one tile more.
+    """
+    aligned, more = align_panel(panel), [align_panel(other) for other in others]
+    maps = (aligned.reference, aligned.base, aligned.adapted, *(other.adapted for other in more))
     low, high = color_range(*maps)
     tiles = [colorize(depth, low, high, aligned.kind) for depth in maps]
-    before, after, near, far = _in_units((*aligned.errors, low, high), aligned.unit)
-    scores = "unknown" if np.isnan(aligned.errors).any() else f"{before} before, {after} after"
+    errors = (*aligned.errors, *(other.errors[1] for other in more))
+    before, *after, near, far = _in_units((*errors, low, high), aligned.unit)
+    scores = "unknown" if np.isnan(errors).any() else f"{before} before, {' and '.join(after)} after"
     caption = f"{panel.label}   RMSE in the outline: {scores}   (colours {near} to {far})"
     return GridRow(caption, [_picture(panel), *tiles], panel.target)
 

@@ -66,7 +66,7 @@ OWN = {
     ),
 }
 SELECTORS = ("gce", "normalized_gce", "tom_rmse")
-LAMBDA_C = {"consensus": 1.0, "surface": 2.0}
+LAMBDA_C = {"consensus": 1.0, "surface": 1.5}
 
 RANGES = (
     (
@@ -142,7 +142,7 @@ class GiftTrainingArguments:
     )
     lambda_c: float | None = _arg(
         "weight of the group consistency, Eq. 6, or of the distance to the surface target; default 1 for consensus, "
-        "2 for surface",
+        "1.5 for surface",
         None,
     )
     lambda_d: float = _arg("weight of the self-distillation, Eq. 6; 0 collapses the depth", 1.0)
@@ -155,8 +155,12 @@ class GiftTrainingArguments:
     flip: bool = _arg("surface: show every second image as in a mirror, with its own target", False)
     fills: int = _arg("surface: copies of each photo with its target painted, which the targets are made from", 6)
     surface_model: Literal["auto", "plane", "quantile"] = _arg("surface: what a surface is taken for", "auto")
-    surface_quantile: float = _arg("surface: of inverse depth over the observations; higher is nearer", 0.8)
-    surface_tau: float = _arg("surface: share of the predictions below the plane", 0.7)
+    surface_quantile: float | None = _arg(
+        "surface: of inverse depth over the observations; higher is nearer; default 0.65, without fills 0.8", None
+    )
+    surface_tau: float | None = _arg(
+        "surface: share of the predictions below the plane; default 0.5, without fills 0.7", None
+    )
     gradient_checkpointing: bool = _arg(
         "recompute the blocks in the backward; smaller graphs, more are retained", False
     )
@@ -266,7 +270,9 @@ class GiftTrainingArguments:
                 raise ValueError(f"{name}: target: {self.target} does not take it")
         if self.lambda_c is None:
             self.lambda_c = LAMBDA_C[self.target]
-        self.surface_settings()
+        settings = self.surface_settings()
+        if self.target == "surface":
+            self.surface_quantile, self.surface_tau = settings.surface_quantile, settings.surface_tau
 
     def _foreign(self) -> tuple[str, ...]:
         (other,) = OWN.keys() - {self.target}

@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save_file
 
 from gift_peft.adapters.folder import ADAPTER_FILES, ADAPTER_WEIGHTS
 from gift_peft.dataset.gift_i import dataset_fingerprint
-from gift_peft.files import jsonable, reason, remove_folder, whole_folder, write_whole
+from gift_peft.files import jsonable, reason, remove_folder, strangers, whole_folder, write_whole
 from gift_peft.models.identity import FILES, earlier_revision, teacher_revision
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
 
@@ -271,11 +271,12 @@ def prune_checkpoints(output_dir: Path, step: int, limit: int | None, keep: list
     """Delete all but the newest `limit` checkpoints up to `step`; those of the steps in `keep` neither count nor go.
 
     Nor do later ones, which a run has that was resumed before them: they may be damaged, and shall not push out the
-    one that was just written.
+    one that was just written. One in which somebody has put a file stays.
     """
     found = [f for f in list_checkpoints(output_dir) if _step(f) <= step and _step(f) not in keep]
     for folder in found[: -limit if limit else 0]:
-        remove_folder(folder)
+        if not strangers(folder, CHECKPOINT_FILES):
+            remove_folder(folder)
 
 
 @contextmanager

@@ -47,7 +47,7 @@ from gift_peft.training.start import (
     stop_signals,
     tell_lost_processes,
 )
-from gift_peft.training.teacher import make_proxies
+from gift_peft.training.teacher import make_proxies, told_of_surface
 
 
 @dataclass
@@ -200,8 +200,9 @@ def _groups(args: GiftTrainingArguments, teacher: DepthModel, accelerator: Accel
         if surface is None:
             make(splits)
         else:  # with the surface targets of a split its proxies are made too
-            for split in splits:
-                make([split], **({"surface": surface, "kind": args.prediction_kind} if split == "train" else {}))
+            if "validation" in splits:
+                make(["validation"])
+            surface_folder = make(["train"], surface=surface, kind=args.prediction_kind)
     except PermissionError as error:
         options = ("x".join(map(str, size)), args.proxies_dir, args.model_revision, surface)
         command = proxies_command(args.model_name_or_path, args.dataset_name, *options)
@@ -215,6 +216,11 @@ def _groups(args: GiftTrainingArguments, teacher: DepthModel, accelerator: Accel
             if split == "train" and surface is None:
                 for group_id, names in zip(rows["group_id"], rows["image_names"], strict=True):
                     check_pair(group_id, len(names))
+            if split == "train" and surface is not None:
+                told = told_of_surface(surface_folder, split, rows["group_id"])
+                accelerator.print(
+                    "\n".join(["Surface targets of the training groups", *(f"  {line}" for line in told)])
+                )
             options = (args.dataloader_num_workers, cache_dir, accelerator.device.type == "cuda")
             groups[split] = PreparedGroups(rows, teacher.processor, size, *options)
     return groups

@@ -31,7 +31,8 @@ def holds_run(output: Path) -> bool:
 
 def check_folder(output: Path, args: GiftTrainingArguments) -> None:
     """Raise ValueError if the run could only write by replacing or deleting what no run of ours has written."""
-    unknown = [f"{folder.name}/" for folder in _folders(output) if not _is_ours(folder)]
+    foreign = [folder for folder in _folders(output) if not _is_ours(folder)]
+    unknown = [f"{folder.name}/" for folder in foreign if folder.is_file() or strangers(folder)]
     metrics = output / METRICS
     if metrics.exists() and not _is_metrics(metrics):
         unknown.append(METRICS)

@@ -6,7 +6,8 @@ are computed from the proxies, and from what the teacher predicts for the flippe
 (surface_targets.py).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +23,7 @@ from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.proxies import (
     EARLIER,
     SURFACE_SUFFIX,
+    TOLD,
     ProxyStore,
     SurfaceSettings,
     default_proxies_dir,
@@ -36,11 +38,12 @@ from gift_peft.dataset.proxies import (
     write_surface,
 )
 from gift_peft.dataset.rows import parsed
+from gift_peft.evaluation.surface_check import describe, surface_lines
 from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import pixel_settings, resize_mask
 from gift_peft.rules import GroupPictures
-from gift_peft.surface_targets import paint_fills, surface_target
+from gift_peft.surface_targets import SurfaceTarget, paint_fills, surface_target
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -119,8 +122,10 @@ def make_proxies(
         file = f"{row.group_id}{SURFACE_SUFFIX}.safetensors"
         known = surface_header | pixels | mask_digests(row)
         if overwrite or not holds(store.path(file), known | earlier, surface_command, "surface target"):
-            proxies, _ = store.read(row.group_id, row.names, pixels)
-            write_surface(store.place(file), known, *_surface_row(model, row, proxies, surface, batch_size))
+            proxies, reference = store.read(row.group_id, row.names, pixels)
+            row = replace(row, reference_proxy=reference)
+            *targets, told = _surface_row(model, row, proxies, surface, batch_size)
+            write_surface(store.place(file), known | {TOLD: told}, *targets)
 
     what = "proxies" if surface is None else "surface targets"
     problem = None
@@ -134,6 +139,17 @@ def make_proxies(
         problem = error
     _raise_everywhere(problem, state)
     return folder / named
+
+
+def told_of_surface(folder: Path, split: str, group_ids: Iterable[str]) -> list[str]:
+    """What the surface targets of a split change, per surface kind: `surface_lines` of their files' headers.
+
+    Args:
+        folder: what `make_proxies` returned. split: of the dataset. group_ids: of its groups.
+    """
+    store = ProxyStore(str(folder.parent), folder.name, split, {}, "")
+    files = ((name, store.path(f"{name}{SURFACE_SUFFIX}.safetensors")) for name in group_ids)
+    return surface_lines((name, read_header(path).get(TOLD, {})) for name, path in files)
 
 
 def _is_current(path: Path, expected: dict, command: str, what: str, names: Sequence[str]) -> bool:
@@ -168,8 +184,8 @@ def _require_finite(prediction: torch.Tensor, row: GroupPictures, name: str) -> 
 
 def _surface_row(
     model: DepthModel, row: GroupPictures, proxies: torch.Tensor, settings: SurfaceSettings, batch_size: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(target, target_flipped), each (N, h, w), of one row and its proxies; ValueError naming the group.
+) -> tuple[torch.Tensor, torch.Tensor, dict]:
+    """(target, target_flipped), each (N, h, w), and what is known of them, of one row; ValueError naming the group.
 
     A row without a pixel to teach at this size keeps its own predictions. Flipped are the pixels that the network
     takes, as training does it: what a resized photo's mirror image shows may differ by rounding.
@@ -178,7 +194,7 @@ def _surface_row(
     valids = np.stack([resize_mask(valid, model.size) for valid in row.valids]) if row.valids else None
     flipped = model.predict(model.inputs(row.images).flip(-1), batch_size)
     if not (masks if valids is None else masks & valids).any():
-        return proxies, flipped
+        return proxies, flipped, {}
     fills: list[torch.Tensor] = []
     fills_flipped: list[torch.Tensor] = []
     for name, image, mask, mirrored in zip(row.names, row.images, row.masks, flipped, strict=True):
@@ -190,7 +206,7 @@ def _surface_row(
             fills_flipped.append(model.predict(pixels.flip(-1), batch_size))
             _require_finite(torch.stack([fills[-1], fills_flipped[-1]]), row, f"a fill of {name}")
 
-    def surface(own: torch.Tensor, painted: list[torch.Tensor], turn: slice) -> torch.Tensor:
+    def surface(own: torch.Tensor, painted: list[torch.Tensor], turn: slice) -> tuple[torch.Tensor, SurfaceTarget]:
         found = surface_target(
             own.numpy(),
             masks[:, :, turn],
@@ -205,10 +221,12 @@ def _surface_row(
         target = torch.from_numpy(found.depth).float()
         if not target.isfinite().all():
             raise ValueError("the surface target has NaN or infinite values")
-        return target
+        return target, found
 
     try:
-        return surface(proxies, fills, slice(None)), surface(flipped, fills_flipped, slice(None, None, -1))
+        target, found = surface(proxies, fills, slice(None))
+        target_flipped, _ = surface(flipped, fills_flipped, slice(None, None, -1))
+        return target, target_flipped, describe(row, proxies, found, model.known_kind())
     except ValueError as error:
         raise ValueError(f"group {row.group_id}: {error}") from None
 

@@ -128,15 +128,16 @@ def test_out_of_memory_halves_the_budget_and_the_group_is_done_again(room, when,
         p.grad = torch.ones_like(p)
     with caplog.at_level(logging.WARNING, "gift_peft"):
         step.accumulate(*data)
-        first = len(caplog.records)
-        assert first and "out of memory" in caplog.text
+        assert "out of memory" in caplog.text
         got = gradients(model)
         assert all(torch.equal(got[name], torch.ones_like(want[name]).add_(want[name])) for name in want)
         budget = step.budget.bytes
         for _ in range(3):
             step.accumulate(*data)
+        learned = len(caplog.records)
+        step.accumulate(*data)
     assert step.budget.bytes <= budget and step.budget.images(data[0], data[1].float()) <= room
-    assert len(caplog.records) <= first + 1  # it has learned
+    assert len(caplog.records) == learned <= 4  # 9, 4, 2, 1 are halves
     assert model.alive == 0
 
 
@@ -261,6 +262,14 @@ def test_at_most_eight_on_cuda(monkeypatch):
     monkeypatch.setattr(model, "parameters", lambda: iter([OnCuda]))
     assert budget.widen(data[0], 2, data[2]) == memory.CUDA_MOST_IMAGES == 8
     assert budget.widen(data[0], 2, data[2][:5]) == 5
+
+
+@pytest.mark.parametrize(("room", "expected"), [(0, 2), (11, 2), (20, 4), (47, 6), (82, 8), (400, 8)])
+def test_on_cuda_most_of_the_room_is_for_graphs(room, expected):
+    """24, 40, 80 and 139 GiB for Depth Anything V2-Large: a replay costs more there than launches do."""
+    chosen = memory.micro_batch_for(room, 2, 55, on_cuda=True)
+    assert chosen == expected
+    assert room >= 55 or 2 * (chosen - 2) <= room / 4
 
 
 def test_one_image_where_two_do_not_fit():

@@ -25,7 +25,7 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
 
 from gift_peft.adapters.recipes import get_gift_model
-from gift_peft.memory import CUDA_MARGIN, CUDA_MOST_IMAGES
+from gift_peft.memory import CUDA_MARGIN, micro_batch_for
 
 BACKBONES = ("depth-anything-v2-large", "vggt-1b", "metric3d-v2-giant2")
 HALF = 0.5  # counted in float32, computed in bf16
@@ -161,10 +161,12 @@ def count(model: nn.Module, size: tuple[int, int]) -> Counted:
     return Counted(counters[0].work(), counters[1].work(), HALF * sum(saved.values()), 1.5 * every + 4 * trained)
 
 
-def epoch_seconds(counted: Counted, gpu: Gpu, micro_batch: int, launch: float) -> dict[str, float]:
-    """Device and host seconds of an epoch, and the share of images whose graph is kept."""
-    room = gpu.memory * (1 - CUDA_MARGIN) - counted.weights - 2 * micro_batch * counted.graph
-    fit = max(0, int(room // counted.graph))
+def epoch_seconds(counted: Counted, gpu: Gpu, launch: float, micro_batch: int | None = None) -> dict[str, float]:
+    """Device and host seconds of an epoch, the share of images whose graph is kept, and the micro-batch (auto's)."""
+    room = gpu.memory * (1 - CUDA_MARGIN) - counted.weights
+    fit = max(0, int(room // counted.graph) - 4)  # of two images a replay and its backward
+    micro_batch = micro_batch or micro_batch_for(fit, 2, max(GROUP_SIZES), on_cuda=True)
+    fit = max(0, fit - 2 * (micro_batch - 2)) if fit < max(GROUP_SIZES) else fit
     device = host = kept = images = 0.0
     for count, groups in GROUP_SIZES.items():
         retained = min(count, fit // micro_batch * micro_batch) if fit < count else count
@@ -174,29 +176,36 @@ def epoch_seconds(counted: Counted, gpu: Gpu, micro_batch: int, launch: float) -
         launches += ceil(replayed / micro_batch) * counted.forward.kernels
         device, host = device + groups * seconds, host + groups * launches * launch
         kept, images = kept + groups * retained, images + groups * count
-    return {"device": device, "host": host, "epoch": max(device, host), "kept": kept / images}
+    return {
+        "device": device,
+        "host": host,
+        "epoch": max(device, host),
+        "kept": kept / images,
+        "micro_batch": micro_batch,
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gpu", choices=list(GPUS), nargs="+", default=list(GPUS))
     parser.add_argument("--models", choices=list(CONFIGS), nargs="+", default=list(BACKBONES))
-    parser.add_argument("--micro_batch_size", type=int, default=CUDA_MOST_IMAGES)
+    parser.add_argument("--micro_batch_size", type=int, help="default: what auto takes")
     parser.add_argument("--launch_microseconds", type=float, default=10.0, help="host time per kernel")
     args = parser.parse_args()
     print("Estimates (examples/tools/roofline.py), nothing was measured; host: what launching the kernels takes.\n")
-    print("| model | GPU | TFLOP per image, forward / backward | kernels | GiB a graph | graphs kept | s per epoch |")
-    print("|---|---|---:|---:|---:|---:|---:|")
+    print("| model | GPU | TFLOP per image, forward / backward | kernels | GiB a graph | batch | kept | s per epoch |")
+    print("|---|---|---:|---:|---:|---:|---:|---:|")
     for name in args.models:
         with torch.device("meta"):
             model = get_gift_model(CONFIGS[name].build()).eval()
         counted = count(model, CONFIGS[name].size)
         for gpu in args.gpu:
-            result = epoch_seconds(counted, GPUS[gpu], args.micro_batch_size, args.launch_microseconds * 1e-6)
+            result = epoch_seconds(counted, GPUS[gpu], args.launch_microseconds * 1e-6, args.micro_batch_size)
             print(
                 f"| {name} | {gpu} | {counted.forward.flops() / 1e12:.2f} / {counted.backward.flops() / 1e12:.2f} | "
                 f"{counted.forward.kernels} + {counted.backward.kernels} | {counted.graph / 2**30:.2f} | "
-                f"{result['kept']:.0%} | {result['device']:.0f} (host {result['host']:.0f}) |"
+                f"{result['micro_batch']} | {result['kept']:.0%} | "
+                f"{result['device']:.0f} (host {result['host']:.0f}) |"
             )
 
 

@@ -110,11 +110,8 @@ class GraphBudget:
         `measured` images had the micro-batch whose graph was measured. Larger ones, where they are replayed, need more
         beside the graphs that are kept: `reserve` takes that off. `canvas` as in `images`, of the largest group.
         """
-        room, count = self.images(pixel_values, canvas), len(canvas)
-        if count > room:
-            count = measured + room // 2  # the graph of a replay, and as much for its backward
-            count = count - count % 2 or 1
-        return min(count, CUDA_MOST_IMAGES) if next(self._model.parameters()).device.type == "cuda" else count
+        on_cuda = next(self._model.parameters()).device.type == "cuda"
+        return micro_batch_for(self.images(pixel_values, canvas), measured, len(canvas), on_cuda)
 
     def reserve(self, pixel_values: Tensor, measured: int, count: int, canvas: Tensor) -> None:
         """Set aside what micro-batches of `count` images take where groups are too large to be kept whole."""
@@ -152,6 +149,18 @@ class GraphBudget:
         if device.type == "cpu":
             return int(CPU_SHARE * available_memory() / self._num_local_processes) - reserved
         return 0  # elsewhere nobody tells how much is free
+
+
+def micro_batch_for(room: int, measured: int, largest: int, on_cuda: bool) -> int:
+    """Images per forward where `room` graphs may be kept beside a micro-batch of `measured` images.
+
+    What a replay of more takes, its graph and as much for the backward, is not there for graphs to keep. On a CPU all
+    of the room may go into that; on CUDA a quarter, because there larger batches save launches only.
+    """
+    if largest > room:
+        more = room // (8 if on_cuda else 2)
+        largest = (measured + more) // 2 * 2 or 1
+    return min(largest, CUDA_MOST_IMAGES) if on_cuda else largest
 
 
 def graph_bytes(

@@ -41,14 +41,14 @@ def test_arithmetic_is_that_of_the_profile(roofline):
 
 def test_a_better_gpu_is_faster_and_replays_cost(roofline):
     work, gpu = counted(roofline)[0], roofline.GPUS["rtx-4090"]
-    now = roofline.epoch_seconds(work, gpu, 8, 1e-5)
-    assert now["kept"] == 1 and now["epoch"] == max(now["device"], now["host"])
+    now = roofline.epoch_seconds(work, gpu, 1e-5)
+    assert now["kept"] == 1 and now["micro_batch"] == 8 and now["epoch"] == max(now["device"], now["host"])
     for name in ("matrix", "convolution", "attention", "bandwidth"):
         better = replace(gpu, **{name: 2 * getattr(gpu, name)})
-        assert now["device"] / 2 < roofline.epoch_seconds(work, better, 8, 1e-5)["device"] < now["device"]
-    small = roofline.epoch_seconds(work, replace(gpu, memory=work.weights + 24 * work.graph), 8, 1e-5)
+        assert now["device"] / 2 < roofline.epoch_seconds(work, better, 1e-5)["device"] < now["device"]
+    small = roofline.epoch_seconds(work, replace(gpu, memory=work.weights + 24 * work.graph), 1e-5)
     assert small["kept"] < 1 and small["device"] > now["device"]
-    assert roofline.epoch_seconds(work, gpu, 2, 1e-5)["host"] > 2 * now["host"]
+    assert roofline.epoch_seconds(work, gpu, 1e-5, 2)["host"] > 2 * now["host"]
 
 
 def test_the_first_gpu_run_runs_without_one():

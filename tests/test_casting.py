@@ -68,6 +68,24 @@ def test_a_weight_is_cast_once_and_its_cast_is_kept_once():
     assert frozen * 0.9 < apart - shared < frozen * 1.1  # the first block's query needs no gradient of its input
 
 
+def test_casts_that_graphs_share_are_not_counted_as_an_images(accelerator):
+    """On a CPU too, where the graph's tensors are looked at one by one."""
+    model, data = gift_model(torch.float32), group(4, torch.float32)
+    step = GroupStep(model, accelerator=accelerator)
+    step.accumulate(*data)
+    (measured,) = step.budget._image_bytes.values()
+
+    def forward():
+        with torch.autocast("cpu", torch.bfloat16, cache_enabled=False):
+            return model(pixel_values=data[0][:2]).predicted_depth
+
+    with FrozenCasts(model) as casts:
+        with_casts = graph_bytes(model, forward, data[0])[1]
+        shared = sum(cast.nbytes for cast in casts.tensors())
+    assert shared > 10_000
+    assert measured == pytest.approx((with_casts - shared) / 2, rel=0.02)
+
+
 def test_outside_of_autocast_layers_stay_in_float32():
     class Model(nn.Module):
         def __init__(self):

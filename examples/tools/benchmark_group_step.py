@@ -76,8 +76,7 @@ class Bench:
         rows = load_gift_i(folder / "raw", "train", teacher=base, size=config.size)
         self.index = {len(names): i for i, names in enumerate(rows["image_names"])}
         self.groups = PreparedGroups(rows, processor, config.size, cache_dir=folder / "cache")
-        # Keeps what it learned about memory, and its micro-batch.
-        self.step = GroupStep(self.model, micro_batch_size="auto", accelerator=self.accelerator)
+        self.step = GroupStep(self.model, micro_batch_size="auto", accelerator=self.accelerator)  # as it has learned
         self.replay = GroupStep(self.model, retain=0, accelerator=self.accelerator)
         self.pair = GroupStep(self.model, retain=2, accelerator=self.accelerator)
 
@@ -100,8 +99,7 @@ class Bench:
         feed = self.groups.take([self.index[size]])
         started = time.perf_counter()
         if method != "a":
-            step = self.step_of(method, size)
-            output = self.update(step, feed, phases)
+            output = self.update(self.step_of(method, size), feed, phases)
             return Timing(time.perf_counter() - started, phases.seconds, output.forwards, 1)
         with phases("load"):
             group = next(feed)
@@ -225,12 +223,10 @@ def measure_options(bench: Bench, size: int, repeats: int, compiled: bool) -> di
         step = GroupStep(model, retain=retain, accelerator=bench.accelerator)
         seconds = []
         for _ in range(repeats + 1):
-            profiling.synchronize(bench.device)
             started = time.perf_counter()
-            step.accumulate(group.pixel_values, group.mask, group.target)
-            profiling.synchronize(bench.device)
-            model.zero_grad(set_to_none=True)
+            step.accumulate(group.pixel_values, group.mask, group.target)  # waits for the device at its end
             seconds.append(time.perf_counter() - started)
+            model.zero_grad(set_to_none=True)
         medians[name] = statistics.median(seconds[1:])
         del model, step
     return medians

@@ -94,7 +94,7 @@ class GroupStep:
         self._world = accelerator.num_processes if accelerator else 1
         self._casts = FrozenCasts(model) if self.mixed_precision == "bf16" else None
         budget = GraphBudget(model, local_processes(self._world), self._casts)
-        self.budget = budget if retain == "auto" or micro_batch_size == "auto" else None
+        self.budget = budget if retain == "auto" else None
         self._parameters = list(model.parameters())
         self.first_share: Tensor | None = None
         self._watched = None  # what must not change between a snapshot and its replay: found with the first group

@@ -11,8 +11,7 @@ The groups follow GIFT-I: 353 groups of 2 to 55 images, 3,268 images, 20,339 pai
 timed and an epoch is extrapolated from it; all four are run in turn within each stratum and repeat, so that whatever
 else the machine does hits them alike. On CPU the embedded tiny model and Depth Anything V2-Small's configuration (12
 blocks) run at 112x140; with a CUDA device also Depth Anything V2-Large, VGGT-1B and Metric3D V2 in bf16 at 476x644.
-Weights are random or do not matter, and pictures are noise: only time and memory are looked at. Writes benchmark.json
-and benchmark.md.
+Weights are random or do not matter, and pictures are noise: only time and memory are looked at.
 """
 
 import argparse

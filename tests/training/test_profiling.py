@@ -8,12 +8,14 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from gift_peft.adapters.recipes import get_gift_model
+from gift_peft.training.precision import exact_output
 from gift_peft.training.profiling import count_flops
 
 
 @pytest.mark.parametrize("head", ["full", "lora"])
 def test_flops_are_those_of_a_real_forward_and_backward(head):
     model = get_gift_model(tiny_model(), rank=2, head=head)
+    exact_output(model)  # as a run does
     pixels = torch.rand(2, 3, *SIZE)
     with sdpa_kernel(SDPBackend.MATH):  # PyTorch counts nothing for the fused attention of CPUs
         with FlopCounterMode(display=False) as forward:

@@ -47,10 +47,11 @@ class _OutOfAutocast:
         self.left = False
 
     def leave(self, module: nn.Module, args: tuple) -> tuple | None:
-        self.left = torch.is_autocast_enabled(args[0].device.type)
+        device = args[0].device.type  # meta, where arithmetic is counted, knows no autocast
+        self.left = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
         if not self.left:
             return None
-        torch.set_autocast_enabled(args[0].device.type, False)
+        torch.set_autocast_enabled(device, False)
         return args[0].float(), *args[1:]
 
     def enter(self, module: nn.Module, args: tuple, output: Any) -> None:

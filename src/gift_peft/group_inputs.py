@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from numbers import Real
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,7 +35,7 @@ class GroupInputs:
     target: Tensor
     valid: Tensor | None = None
     names: Sequence[str] | None = None
-    pairs: Pairs | None = None
+    pairs: Pairs = None  # pyright: ignore[reportAssignmentType]  (never None after __post_init__)
 
     def __post_init__(self) -> None:
         _check(self.pixel_values, self.mask, self.target, self.valid, self.names)
@@ -77,7 +78,7 @@ def check_lambdas(**values: float) -> None:
 def _check(
     pixel_values: Tensor, mask: Tensor, target: Tensor, valid: Tensor | None, names: Sequence[str] | None
 ) -> None:
-    given = {"pixel_values": pixel_values, "mask": mask, "target": target}
+    given: dict[str, Any] = {"pixel_values": pixel_values, "mask": mask, "target": target}
     given |= {} if valid is None else {"valid": valid}
     for what, tensor in given.items():
         if not isinstance(tensor, Tensor):

@@ -72,8 +72,8 @@ class GroupStep:
         accelerator: Accelerator | None = None,
     ) -> None:
         check_lambdas(lambda_c=lambda_c, lambda_d=lambda_d)
-        is_number = isinstance(micro_batch_size, int) and not isinstance(micro_batch_size, bool)
-        if micro_batch_size != "auto" and (not is_number or micro_batch_size < 1):
+        fixed = isinstance(micro_batch_size, int) and not isinstance(micro_batch_size, bool) and micro_batch_size >= 1
+        if micro_batch_size != "auto" and not fixed:
             raise ValueError(f'micro_batch_size must be a positive integer or "auto", got {micro_batch_size!r}')
         if retain != "auto" and (isinstance(retain, bool) or not isinstance(retain, int) or retain < 0):
             raise ValueError(f'retain must be "auto" or a number of images >= 0, got {retain!r}')
@@ -136,7 +136,8 @@ class GroupStep:
         device = parameters[0].device
         mask, target = (part.to(device, non_blocking=True) for part in (group.mask, group.target))
         valid = None if group.valid is None else group.valid.to(device, non_blocking=True)
-        batches = [slice(i, i + self.micro_batch_size) for i in range(0, len(mask), self.micro_batch_size)]
+        cut = int(self.micro_batch_size)
+        batches = [slice(i, i + cut) for i in range(0, len(mask), cut)]
 
         canvas = self._canvas(group, device)
         graphs: dict[int, Tensor] = {}
@@ -228,12 +229,12 @@ class GroupStep:
         pixel_values = group.pixel_values
 
         def store(batch: slice, prediction: Tensor) -> None:
-            self._sizes[tuple(pixel_values.shape[1:])] = tuple(prediction.shape[-2:])
+            self._sizes[tuple(pixel_values.shape[1:])] = prediction.shape[-2], prediction.shape[-1]
             if prediction.shape == canvas[batch].shape:
                 canvas[batch] = prediction.detach()
 
         mine = self._mine(batches)
-        if self.retain == "auto" and mine and not self.budget.knows(pixel_values):
+        if self.budget is not None and mine and not self.budget.knows(pixel_values):
             with torch.enable_grad():
                 graphs[mine[0]] = self.budget.measure(pixel_values[batches[mine[0]]], self._predict)
             store(batches[mine[0]], graphs[mine[0]])
@@ -254,7 +255,7 @@ class GroupStep:
     def _retained(self, pixel_values: Tensor, batches: list[slice], canvas: Tensor) -> list[int]:
         """The last of this process's micro-batches that keep their graphs, whole ones only."""
         mine = self._mine(batches)
-        if self.retain != "auto":  # so many images of the group
+        if self.budget is None:  # so many images of the group
             candidates, room = range(len(batches)), int(self.retain)
         else:  # so many images of this process
             candidates, room = mine, self.budget.images(pixel_values, canvas) if mine else 0
@@ -276,7 +277,7 @@ class GroupStep:
             if self.first_share is None:
                 terms = (self.lambda_c * loss.consistency, self.lambda_d * loss.distillation)
                 pulls = [torch.autograd.grad(term, leaf, retain_graph=True)[0].abs().sum() for term in terms]
-                self.first_share = pulls[1] / sum(pulls).clamp(min=torch.finfo(leaf.dtype).tiny)
+                self.first_share = pulls[1] / (pulls[0] + pulls[1]).clamp(min=torch.finfo(leaf.dtype).tiny)
             (gradient,) = torch.autograd.grad(loss.total, leaf)
         terms = loss.total.detach(), loss.consistency.detach(), loss.distillation.detach()
         return GiftLoss(*terms, loss.num_pairs), gradient
@@ -313,7 +314,7 @@ class GroupStep:
                 return attempt()
             except RuntimeError as error:
                 num_images = sum(map(len, graphs.values()))
-                if self.retain != "auto" or not num_images or not is_out_of_memory(error):
+                if self.budget is None or not num_images or not is_out_of_memory(error):
                     raise
             # Outside of `except` the error is gone, and with it the frames whose tensors still took memory.
             graphs.clear()

@@ -277,7 +277,8 @@ def _forward(network: Any, pixel_values: torch.Tensor) -> Any:
 @contextmanager
 def _without_tf32() -> Iterator[None]:
     """Inside, float32 has all of its 23 bits on CUDA too; cuDNN's convolutions would else round to 10."""
-    parts = (torch.backends.cudnn.conv, torch.backends.cudnn.rnn, torch.backends.cuda.matmul)
+    cudnn: Any = torch.backends.cudnn
+    parts: list[Any] = [cudnn.conv, cudnn.rnn, torch.backends.cuda.matmul]
     before = [part.fp32_precision for part in parts]
     try:
         for part in parts:

@@ -42,7 +42,7 @@ def same_bits(step: GroupStep, pixels: torch.Tensor) -> str:
 
 
 def update(step: GroupStep, optimizer: torch.optim.Optimizer, group: GroupInputs) -> None:
-    step.accumulate_inputs(group)
+    step.accumulate(*group.arguments())
     optimizer.step()
     optimizer.zero_grad(set_to_none=True)
 

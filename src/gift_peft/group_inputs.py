@@ -27,7 +27,8 @@ class GroupInputs:
         target (`Tensor`): (N,H,W) floating point, the proxies in native units, finite.
         valid (`Tensor`, *optional*): (N,H,W) bool, False where a warped frame has no pixels.
         names (`Sequence[str]`, *optional*): of the images, for messages.
-        pairs (`Pairs`, *optional*): of `mask` and `valid`; found if not given.
+        pairs (`Pairs`, *optional*): of `mask` and `valid`; if not given they are found and all is checked, so what
+            comes with pairs was checked before.
     """
 
     pixel_values: Tensor
@@ -38,20 +39,21 @@ class GroupInputs:
     pairs: Pairs = None  # pyright: ignore[reportAssignmentType]  (never None after __post_init__)
 
     def __post_init__(self) -> None:
-        _check(self.pixel_values, self.mask, self.target, self.valid, self.names)
         if self.pairs is None:
+            _check(self.pixel_values, self.mask, self.target, self.valid, self.names)
             object.__setattr__(self, "pairs", Pairs.of(self.mask, self.valid))
 
     def __len__(self) -> int:
         return len(self.mask)
 
+    def arguments(self) -> list[Any]:
+        """As `GroupStep.accumulate` takes them."""
+        return [getattr(self, field.name) for field in fields(self)]
+
     def pin_memory(self) -> GroupInputs:
         """The same in pinned memory, from where it travels to a CUDA device while the host goes on."""
-        pinned = object.__new__(GroupInputs)  # nothing to check again
-        for field in fields(self):
-            value = getattr(self, field.name)
-            object.__setattr__(pinned, field.name, value.pin_memory() if hasattr(value, "pin_memory") else value)
-        return pinned
+        pinned = (part.pin_memory() if hasattr(part, "pin_memory") else part for part in self.arguments())
+        return GroupInputs(*pinned)
 
     def check_results(self, finite: Sequence[float], loss: float, gradient: float) -> None:
         """Raise ValueError for what is not finite: each prediction (N flags), the loss, the gradient's largest value.

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from gift_peft.group_inputs import GroupInputs, check_lambdas
-from gift_peft.losses import GiftLoss, gift_terms
+from gift_peft.losses import GiftLoss, Pairs, gift_terms
 from gift_peft.memory import FrozenCasts, GraphBudget, is_out_of_memory, local_processes, release_memory
 from gift_peft.replayable import check_replayable, check_watched, mixed_precision_of, watched
 
@@ -109,21 +109,18 @@ class GroupStep:
         target: Tensor,
         valid: Tensor | None = None,
         names: Sequence[str] | None = None,
+        pairs: Pairs | None = None,
     ) -> GroupStepOutput:
         """Add one group's gradient into `.grad`; every process passes the whole group.
 
         Args: `pixel_values` (N,3,h,w) on any device, `mask` (N,H,W) bool, `target` (N,H,W) proxies in native units,
-        `valid` (N,H,W) bool or None, with (H,W) the size of the prediction; `names` of the images, for messages.
+        `valid` (N,H,W) bool or None, with (H,W) the size of the prediction; `names` of the images, for messages;
+        `pairs` of `GroupInputs`, which has checked the rest where the group was loaded. The host waits for the device
+        once, after the last backward.
         Raises ValueError, on all processes and with `.grad` as it was, for inconsistent shapes, non-finite
         predictions, proxies, loss or gradients, and a model that is not replayable (dropout, BatchNorm in training).
         """
-        return self.accumulate_inputs(GroupInputs(pixel_values, mask, target, valid, names))
-
-    def accumulate_inputs(self, group: GroupInputs) -> GroupStepOutput:
-        """`accumulate` of a group that was checked where it was loaded.
-
-        The host waits for the device once, for everything that it has to know, after the last backward.
-        """
+        group = GroupInputs(pixel_values, mask, target, valid, names, pairs)  # pyright: ignore[reportArgumentType]
         self._check_model()
         parameters = [p for p in self._parameters if p.requires_grad]
         if not parameters:

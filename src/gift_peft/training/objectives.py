@@ -105,7 +105,7 @@ class Consensus:
         return Loaded(group.group_id, inputs.pin_memory() if self.groups.pin else inputs)
 
     def accumulate(self, group: Loaded) -> Losses:
-        output = self.step.accumulate_inputs(group.inputs)
+        output = self.step.accumulate(*group.inputs.arguments())
         return Losses(float(output.total), float(output.consistency), float(output.distillation), output.num_pairs)
 
     def named(self, group: Loaded) -> str:

@@ -54,7 +54,7 @@ def timed_update(
     with phases("load"):
         group = load()
     step.phase = phases
-    output = step.accumulate_inputs(group)
+    output = step.accumulate(*group.arguments())
     with phases("optimizer"):
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)

@@ -48,7 +48,7 @@ RECORD = {
 
 def make(tmp_path, adapted, **changes):
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out", **changes)
-    record = upload.run_record(args, torch.device("cpu"), **RECORD, metrics={"base": ROW, "adapter": adapted})
+    record = upload.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
     (tmp_path / "README.md").write_text(model_card.model_card(asdict(args), record))
     return ModelCard.load(tmp_path / "README.md")
 
@@ -186,7 +186,7 @@ def test_every_evaluation_keeps_its_own_metrics(tmp_path):
     depth = report_of(random_rows([2, 3], seed=1), reference="depth", unit="mm")
     booster = report_of(random_rows([2, 3], seed=2), booster=True)
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out")
-    record = upload.run_record(args, torch.device("cpu"), **RECORD, metrics={"base": ROW, "adapter": ROW})
+    record = upload.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
     loaded = ModelCard(model_card.model_card(asdict(args), record, [proxy, depth, booster]))
     found = {}
     for result in loaded.data.eval_results:
@@ -207,7 +207,7 @@ def test_every_evaluation_keeps_its_own_metrics(tmp_path):
 def test_what_got_worse_stands_under_limits():
     args = GiftTrainingArguments("depth-anything/Depth-Anything-V2-Large-hf", "someone/gift-i", "out")
     adapted = ROW | {"val_tom_rmse": 0.2, "val_other_rmse": 0.3}
-    record = upload.run_record(args, torch.device("cpu"), **RECORD, metrics={"base": ROW, "adapter": adapted})
+    record = upload.run_record(args, **RECORD, metrics={"base": ROW, "adapter": adapted})
     limits = model_card.model_card(asdict(args), record).split("## Limits")[1]
     assert "Other RMSE on the validation groups got worse, by 20.0 %" in limits and "ToM RMSE" not in limits
     report = report_of(random_rows([2, 3]), collapse={"target_mean_ratio": 0.1, "spread_ratio": 1.0, "alarm": True})
@@ -220,11 +220,7 @@ def test_what_got_worse_stands_under_limits():
 def test_nothing_of_the_template_is_left(name, trained, reports):
     args = GiftTrainingArguments(name, "someone/gift-i", "out")
     metrics = {"base": ROW, "adapter": ROW | {"val_other_rmse": 0.3}}
-    record = (
-        upload.run_record(args, torch.device("cpu"), **RECORD, metrics=metrics, dataset_fingerprint="abc-1")
-        if trained
-        else None
-    )
+    record = upload.run_record(args, **RECORD, metrics=metrics, dataset_fingerprint="abc-1") if trained else None
     text = model_card.model_card(asdict(args), record, [report_of(rows) for rows in reports])
     assert not any(mark in text for mark in ("{{", "}}", "{%", "%}", "{#", "None", "Undefined", "\n\n\n"))
     assert text.endswith(".\n") and not any(line.startswith(" |") for line in text.splitlines())
@@ -296,7 +292,7 @@ def test_a_trained_folder_is_not_taken_for_the_backbone_it_is_named_after(base_d
     monkeypatch.chdir(tmp_path)
     (tmp_path / "vggt-1b").mkdir()
     args = GiftTrainingArguments("vggt-1b", "someone/gift-i", "out")
-    record = upload.run_record(args, torch.device("cpu"), **RECORD, metrics={"base": ROW, "adapter": ROW})
+    record = upload.run_record(args, **RECORD, metrics={"base": ROW, "adapter": ROW})
     loaded = ModelCard(model_card.model_card(asdict(args), record))
     assert loaded.data.base_model is None and "paper" not in loaded.text
     with pytest.raises(ValueError, match="needs model_name_or_path"):

@@ -215,10 +215,9 @@ class Surface:
         return f"images {', '.join(name for image in share.images for name in image.names)}"
 
     def first_look(self, quiet: bool) -> list[Losses]:
-        """The base's on each image, from the proxies, and ValueError, as in `Consensus`."""
+        """The base's on each image, from the proxies as in `Consensus`; a fixed target holds without surroundings."""
 
         def look(group: Group) -> list[Losses]:
-            check_surroundings(group.group_id, group.mask, group.valid)
             regions = group.mask if group.valid is None else group.mask & group.valid
             losses = []
             for proxy, target, region in zip(group.target, group.surface_target, regions, strict=True):

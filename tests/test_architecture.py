@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 # outside, and so does `python -m gift_peft`.
 FLOORS = [
     {"losses", "surface_targets", "files", "images", "rules", "options"},
-    {"memory", "group_step"},
+    {"memory", "replayable", "group_inputs", "group_step"},
     {"captures"},
     {"adapters"},
     {"models"},

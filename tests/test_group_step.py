@@ -73,6 +73,36 @@ def test_first_step_of_a_fresh_adapter_has_no_distillation():
     assert output.distillation == 0 and output.total == output.consistency > 0
 
 
+@pytest.mark.parametrize("cut", [1, 2, 3, 5])
+def test_first_distillation_is_zero_for_any_cut_and_rounding(cut):
+    """Proxies of another cut, and a last digit apart, as another number of threads makes them."""
+    model = get_gift_model(tiny_model())
+    pixels, mask, _, _ = group(5, torch.float32)
+    with torch.no_grad(), model.disable_adapter():
+        target = torch.cat([model(pixel_values=x).predicted_depth for x in pixels.split(2)])
+    target = target.nextafter(target + (torch.arange(target.numel()).view_as(target) % 3 - 1))
+    step = GroupStep(model, micro_batch_size=cut)
+    output = step.accumulate(pixels, mask, target)
+    assert output.distillation == 0 and output.total == output.consistency > 0 and step.first_share == 0
+    got = gradients(model)
+    model.zero_grad()
+    GroupStep(model, lambda_d=0, micro_batch_size=cut).accumulate(pixels, mask, target)
+    assert largest_error(got, gradients(model)) == 0
+
+
+def test_the_share_of_rounding_in_the_first_update_is_known():
+    model, data = toy(), group(4, torch.float32)
+    step = GroupStep(model, 0.8, 1.5)
+    step.accumulate(*data)
+    share = step.first_share
+    depth = torch.cat([model(pixel_values=x) for x in data[0].split(2)]).detach().requires_grad_()
+    loss = gift_loss(depth, data[2], data[1], valid=data[3])
+    pulls = [torch.autograd.grad(term, depth, retain_graph=True)[0].abs().sum() for term in loss[1:3]]
+    assert share.item() == pytest.approx((1.5 * pulls[1] / (0.8 * pulls[0] + 1.5 * pulls[1])).item(), rel=1e-5)
+    step.accumulate(*group(3, torch.float32, seed=1))
+    assert step.first_share is share  # of the first group
+
+
 def test_schedule():
     model, data = toy(), group(5, torch.float32)
     assert GroupStep(model, retain=0).accumulate(*data).forwards == 10

@@ -255,6 +255,49 @@ def test_huge_differences_outside_the_mask_do_no_harm():
     assert gift_loss(depth, depth, mask).total == 0
 
 
+# ---- rounding, and devices without float64 ----
+
+
+@pytest.mark.parametrize(("dtype", "bits"), [(torch.float32, 18), (torch.float64, 46)])
+def test_differences_of_rounding_to_a_proxy_count_as_none(dtype, bits):
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(3, 5, 7, generator=generator, dtype=dtype) + 1
+    limit = target.amax((1, 2), keepdim=True) * 2.0**-bits
+    noise = torch.rand(3, 5, 7, generator=generator, dtype=dtype) * 2 - 1
+    mask = torch.zeros(3, 5, 7, dtype=torch.bool)
+    for factor, expected in ((0.9, 0), (4, 1)):
+        depth = (target + noise.sign() * limit * factor).requires_grad_()
+        loss = self_distillation_loss(depth, target, mask)
+        (gradient,) = torch.autograd.grad(loss, depth)
+        assert bool(loss) == bool(gradient.any()) == bool(expected)
+        assert expected == 0 or torch.equal(gradient.sign(), noise.sign())
+    beyond = target.clone()
+    beyond[1, 2, 3] += 1  # one pixel counts in full beside those of rounding
+    loss = self_distillation_loss((beyond + noise * limit * 0.5).to(dtype), target, mask)
+    assert loss.item() == pytest.approx(2 / 3 / 35, rel=1e-4)
+
+
+class NoFloat64(TorchDispatchMode):
+    """Apple's GPUs: no operator may make a float64 tensor."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        output = function(*args, **(kwargs or {}))
+        for tensor in tree_leaves(output):
+            if isinstance(tensor, torch.Tensor) and tensor.dtype == torch.float64:
+                raise TypeError(f"{function}: MPS has no float64")
+        return output
+
+
+@pytest.mark.parametrize("with_valid", [False, True])
+def test_float32_losses_make_no_float64(with_valid):
+    depth, target, mask, valid = random_group(4, 0, 0.5, with_valid=True)
+    depth = depth.float().requires_grad_()
+    with NoFloat64():
+        loss = gift_loss(depth, target.float(), mask, valid=valid if with_valid else None)
+        loss.total.backward()
+    assert depth.grad.any()
+
+
 # ---- masked_l1 ----
 
 

@@ -21,9 +21,11 @@ HOOKS = {  # private name: library, where we use it, what for
     "_attn_implementation": ("transformers", "models/vggt/modeling_vggt.py", "which attention a model was asked for"),
     "_init_weights": ("transformers", "models/*/modeling_*.py", "the start of a network without weights"),
     "_parameters": ("torch", "memory.py", "lends a layer the cast of its weight for one forward"),
+    "_forward_hooks": ("torch", "training/speed.py", "takes out a hook that would break a compiled block's graph"),
+    "_dynamo": ("torch", "training/speed.py", "one compiled graph for batches of any size"),
     "_compiled_call_impl": ("torch", "memory.py", "leaves compiled blocks alone"),
-    "_DropoutNd": ("torch", "group_step.py", "finds every kind of dropout"),
-    "_BatchNorm": ("torch", "group_step.py", "finds every kind of batch normalization"),
+    "_DropoutNd": ("torch", "replayable.py", "finds every kind of dropout"),
+    "_BatchNorm": ("torch", "replayable.py", "finds every kind of batch normalization"),
     "_actions": ("argparse", "options.py", "shows each option of the training arguments in one spelling"),
     "_option_string_actions": ("argparse", "options.py", "tells an option from a value"),
     "_optionals": ("argparse", "training/arguments.py", "takes the options of train out of their one group"),
@@ -109,6 +111,21 @@ def test_torch_says_what_is_compiled():
     assert layer._compiled_call_impl is None, gone("_compiled_call_impl")
     layer.compile()
     assert layer._compiled_call_impl is not None, gone("_compiled_call_impl")
+    assert hasattr(torch.compile(layer.forward), "_torchdynamo_orig_callable"), "torch names compiled forwards anew"
+
+
+def test_torch_compiles_for_batches_of_any_size():
+    assert callable(torch._dynamo.maybe_mark_dynamic), gone("_dynamo")
+    assert isinstance(torch._dynamo.config.recompile_limit, int), gone("_dynamo")
+
+
+def test_transformers_recording_hook_has_its_name():
+    from helpers.tiny import tiny_model
+
+    model = tiny_model()
+    model(pixel_values=torch.zeros(1, 3, 28, 28))
+    names = [hook.__name__ for part in model.modules() for hook in part._forward_hooks.values()]
+    assert "output_capturing_hook" in names, gone("_forward_hooks")
 
 
 @pytest.mark.parametrize("layer", [nn.Dropout(), nn.Dropout2d(), nn.AlphaDropout(), nn.FeatureAlphaDropout()])

@@ -6,13 +6,12 @@ measures, side by side on one machine, with one loader, loss and optimizer (pape
   (a) pairs    naive pair traversal: an update per pair of a group
   (b) replay   the paper's schedule: every image forwarded twice, micro-batches of 2 (retain=0)
   (c) full     one graph over the whole group, no micro-batches, where it fits
-  (d) default  what `gift-peft train` does: retain="auto"
+  (d) default  what `gift-peft train` does: micro-batches and retained graphs by memory
 The groups follow GIFT-I: 353 groups of 2 to 55 images, 3,268 images, 20,339 pairs. A stratified sample of them is
 timed and an epoch is extrapolated from it; all four are run in turn within each stratum and repeat, so that whatever
 else the machine does hits them alike. On CPU the embedded tiny model and Depth Anything V2-Small's configuration (12
 blocks) run at 112x140; with a CUDA device also Depth Anything V2-Large, VGGT-1B and Metric3D V2 in bf16 at 476x644.
-Weights are random or do not matter, and pictures are noise: only time and memory are looked at. Writes benchmark.json
-and benchmark.md.
+Weights are random or do not matter, and pictures are noise: only time and memory are looked at.
 """
 
 import argparse
@@ -23,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
@@ -39,7 +39,8 @@ from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.loader import PreparedGroups
 from gift_peft.dataset.tensors import Group
-from gift_peft.group_step import GroupStep
+from gift_peft.group_inputs import GroupInputs
+from gift_peft.group_step import GroupStep, GroupStepOutput
 from gift_peft.models.loading import load_base
 from gift_peft.training import profiling
 from gift_peft.training.profiling import PHASES, Phases
@@ -74,7 +75,7 @@ class Bench:
         rows = load_gift_i(folder / "raw", "train", teacher=base, size=config.size)
         self.index = {len(names): i for i, names in enumerate(rows["image_names"])}
         self.groups = PreparedGroups(rows, processor, config.size, cache_dir=folder / "cache")
-        self.step = GroupStep(self.model, accelerator=self.accelerator)  # keeps what it learned about memory
+        self.step = GroupStep(self.model, micro_batch_size="auto", accelerator=self.accelerator)  # as it has learned
         self.replay = GroupStep(self.model, retain=0, accelerator=self.accelerator)
         self.pair = GroupStep(self.model, retain=2, accelerator=self.accelerator)
 
@@ -84,14 +85,20 @@ class Bench:
             return GroupStep(self.model, micro_batch_size=num_images, retain=num_images, accelerator=self.accelerator)
         return {"a": self.pair, "b": self.replay, "d": self.step}[method]
 
+    def update(self, step: GroupStep, feed: Iterator[Group], phases: Phases) -> GroupStepOutput:
+        def load() -> GroupInputs:
+            group = next(feed)
+            return GroupInputs(group.pixel_values, group.mask, group.target, group.valid, group.names)
+
+        return profiling.timed_update(step, self.optimizer, load, phases)
+
     def time(self, method: str, size: int, max_pairs: int) -> Timing:
         """The updates of one group by one method; of (a) at most `max_pairs`, spread over the group."""
         phases = Phases(self.device)
         feed = self.groups.take([self.index[size]])
         started = time.perf_counter()
         if method != "a":
-            step = self.step_of(method, size)
-            output = profiling.timed_update(step, self.optimizer, lambda: next(feed), phases)
+            output = self.update(self.step_of(method, size), feed, phases)
             return Timing(time.perf_counter() - started, phases.seconds, output.forwards, 1)
         with phases("load"):
             group = next(feed)
@@ -99,7 +106,7 @@ class Bench:
         pairs = pairs[:: max(1, len(pairs) // max_pairs)][:max_pairs]
         loading = dict(phases.seconds)
         for pair in pairs:
-            profiling.timed_update(self.pair, self.optimizer, lambda pair=pair: pick(group, list(pair)), phases)
+            self.update(self.pair, iter([pick(group, list(pair))]), phases)
         phases.seconds["load"] = loading["load"]  # picking two images is not loading
         return Timing(time.perf_counter() - started, phases.seconds, 2 * len(pairs), len(pairs))
 
@@ -206,24 +213,22 @@ def measure_options(bench: Bench, size: int, repeats: int, compiled: bool) -> di
     }
     if compiled:
         variants["compiled blocks"] = (compile_blocks, "auto")
-    steps = {}
-    for name, (change, retain) in variants.items():
+    group = bench.groups[bench.index[size]]
+    medians = {}
+    for name, (change, retain) in variants.items():  # one model at a time beside the bench's: they are large
         model = get_gift_model(load_base(bench.base)[0]).to(bench.device).eval()
         if change:
             change(model)
-        steps[name] = GroupStep(model, retain=retain, accelerator=bench.accelerator)
-    group = bench.groups[bench.index[size]]
-    seconds: dict[str, list[float]] = {name: [] for name in steps}
-    for repeat in range(repeats + 1):
-        for name, step in steps.items():
-            profiling.synchronize(bench.device)
+        step = GroupStep(model, retain=retain, accelerator=bench.accelerator)
+        seconds = []
+        for _ in range(repeats + 1):
             started = time.perf_counter()
-            step.accumulate(group.pixel_values, group.mask, group.target)
-            profiling.synchronize(bench.device)
-            step.model.zero_grad(set_to_none=True)
-            if repeat:
-                seconds[name].append(time.perf_counter() - started)
-    return {name: statistics.median(values) for name, values in seconds.items()}
+            step.accumulate(group.pixel_values, group.mask, group.target)  # waits for the device at its end
+            seconds.append(time.perf_counter() - started)
+            model.zero_grad(set_to_none=True)
+        medians[name] = statistics.median(seconds[1:])
+        del model, step
+    return medians
 
 
 def measure_memory(bench: Bench) -> dict:
@@ -242,7 +247,7 @@ def measure_memory(bench: Bench) -> dict:
             profiling.reset_peak_memory(bench.device)
             feed = bench.groups.take([bench.index[size]])
             try:
-                profiling.timed_update(step, bench.optimizer, lambda feed=feed: next(feed), Phases(bench.device))
+                bench.update(step, feed, Phases(bench.device))
             except torch.OutOfMemoryError:
                 continue
             peaks[name][size] = profiling.peak_memory(bench.device) - before
@@ -267,7 +272,7 @@ def measure_scaling(bench: Bench, size: int, repeats: int) -> float:
     for _ in range(repeats + 1):
         bench.accelerator.wait_for_everyone()
         started = time.perf_counter()
-        profiling.timed_update(bench.step, bench.optimizer, lambda: next(feed), Phases(bench.device))
+        bench.update(bench.step, feed, Phases(bench.device))
         seconds.append(time.perf_counter() - started)
     return statistics.median(seconds[1:])
 

@@ -8,7 +8,8 @@ whose graphs fit into memory keep them from the snapshot and are not forwarded a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -16,8 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
-from gift_peft.losses import GiftLoss, gift_loss, require_finite
-from gift_peft.memory import GraphBudget, cast_frozen_once, local_processes
+from gift_peft.group_inputs import GroupInputs, check_lambdas
+from gift_peft.losses import GiftLoss, Pairs, gift_terms
+from gift_peft.memory import FrozenCasts, GraphBudget, is_out_of_memory, local_processes, release_memory
+from gift_peft.replayable import check_replayable, check_watched, mixed_precision_of, watched
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -26,7 +29,7 @@ Result = TypeVar("Result")
 
 
 class GroupStepOutput(NamedTuple):
-    """Detached values of one group, equal on all processes.
+    """Values of one group, detached and on the CPU, equal on all processes.
 
     `forwards` counts image forwards over all of them: 2N - retained, without what is repeated for want of memory.
     """
@@ -45,15 +48,17 @@ class GroupStep:
         model: called as `model(pixel_values=x)`; returns (B,H,W) or an object with `.predicted_depth`. Its mode, dtype
             and device are left alone, and it must not be wrapped in DistributedDataParallel.
         lambda_c, lambda_d: weights of consistency and distillation (Eq. 6).
-        micro_batch_size: images per forward; the group is cut once, in image order.
+        micro_batch_size: images per forward; the group is cut once, in image order. "auto": what memory allows, once
+            and for all processes, when the first group has been seen or `choose_micro_batch_size` was asked.
         retain: keep the graphs of the last whole micro-batches, at most this many images, instead of replaying them.
             0 is the paper's schedule; "auto" keeps as many as memory allows (see `budget`), and fewer after running
             out of it. On CPU the gradient does not depend on it, to the bit.
         accelerator: its processes share the micro-batches, and its mixed precision ("no" or "bf16") is used. Without
             one: this process alone, bf16 for a model on CUDA, else no. See the attribute `mixed_precision`.
 
-    Attributes: `budget`, the `GraphBudget` of "auto", else None; `phase`, called with "snapshot", "loss", "replay" and
-    "reduce" for a context around each part of a step, to time it.
+    Attributes: `budget`, the `GraphBudget` of "auto", else None; `first_share`, the distillation's part (0-dim, 0 to
+    1) in the pull on the first group's predictions, which for a fresh adapter is all rounding; `phase`, called with
+    "snapshot", "loss", "replay" and "reduce" for a context around each part of a step, to time it.
     Raises ValueError for fp16, active dropout settings, a wrapped or sharded model and arguments out of range.
     """
 
@@ -62,12 +67,14 @@ class GroupStep:
         model: nn.Module,
         lambda_c: float = 1.0,
         lambda_d: float = 1.0,
-        micro_batch_size: int = 2,
+        micro_batch_size: int | str = 2,
         retain: int | str = "auto",
         accelerator: Accelerator | None = None,
     ) -> None:
-        if isinstance(micro_batch_size, bool) or not isinstance(micro_batch_size, int) or micro_batch_size < 1:
-            raise ValueError(f"micro_batch_size must be a positive integer, got {micro_batch_size!r}")
+        check_lambdas(lambda_c=lambda_c, lambda_d=lambda_d)
+        fixed = isinstance(micro_batch_size, int) and not isinstance(micro_batch_size, bool) and micro_batch_size >= 1
+        if micro_batch_size != "auto" and not fixed:
+            raise ValueError(f'micro_batch_size must be a positive integer or "auto", got {micro_batch_size!r}')
         if retain != "auto" and (isinstance(retain, bool) or not isinstance(retain, int) or retain < 0):
             raise ValueError(f'retain must be "auto" or a number of images >= 0, got {retain!r}')
         if isinstance(model, nn.parallel.DistributedDataParallel):
@@ -81,12 +88,19 @@ class GroupStep:
         self.micro_batch_size = micro_batch_size
         self.retain = retain
         self.accelerator: Any = accelerator  # accelerate does not say that `reduce` of a tensor is a tensor
-        self.mixed_precision = _mixed_precision(model, accelerator)
+        self.mixed_precision = mixed_precision_of(model, accelerator)
         self.phase: Callable[[str], AbstractContextManager] = nullcontext
         self._rank = accelerator.process_index if accelerator else 0
         self._world = accelerator.num_processes if accelerator else 1
-        self.budget = GraphBudget(model, local_processes(self._world)) if retain == "auto" else None
-        _check_replayable(model)
+        self._casts = FrozenCasts(model) if self.mixed_precision == "bf16" else None
+        budget = GraphBudget(model, local_processes(self._world), self._casts)
+        self.budget = budget if retain == "auto" else None
+        self._parameters = list(model.parameters())
+        self.first_share: Tensor | None = None
+        self._watched = None  # what must not change between a snapshot and its replay: found with the first group
+        self._sizes: dict[tuple[int, ...], tuple[int, int]] = {}  # of predictions, by the shape of an image
+        self._shared: set[tuple[int, ...]] = set()  # of those shapes the ones that all processes know the size of
+        check_replayable(model)
 
     def accumulate(
         self,
@@ -95,76 +109,124 @@ class GroupStep:
         target: Tensor,
         valid: Tensor | None = None,
         names: Sequence[str] | None = None,
+        pairs: Pairs | None = None,
     ) -> GroupStepOutput:
         """Add one group's gradient into `.grad`; every process passes the whole group.
 
         Args: `pixel_values` (N,3,h,w) on any device, `mask` (N,H,W) bool, `target` (N,H,W) proxies in native units,
-        `valid` (N,H,W) bool or None, with (H,W) the size of the prediction; `names` of the images, for messages.
+        `valid` (N,H,W) bool or None, with (H,W) the size of the prediction; `names` of the images, for messages;
+        `pairs` of `GroupInputs`, which has checked the rest where the group was loaded. The host waits for the device
+        once, after the last backward.
         Raises ValueError, on all processes and with `.grad` as it was, for inconsistent shapes, non-finite
         predictions, proxies, loss or gradients, and a model that is not replayable (dropout, BatchNorm in training).
         """
-        _check_replayable(self.model)
-        parameters = [p for p in self.model.parameters() if p.requires_grad]
+        group = GroupInputs(pixel_values, mask, target, valid, names, pairs)  # pyright: ignore[reportArgumentType]
+        self._check_model()
+        parameters = [p for p in self._parameters if p.requires_grad]
         if not parameters:
             raise ValueError("the model has no trainable parameter: load the adapter with is_trainable=True")
         if any(p.dtype == torch.float16 for p in parameters):
             raise ValueError("fp16 parameters cannot be trained: load the base in float32")
-        _check_inputs(pixel_values, mask, target, valid, names)
+        self._check_size(group)
+        if self.micro_batch_size == "auto":
+            self.choose_micro_batch_size(group)
         device = parameters[0].device
-        mask, target = mask.to(device), target.to(device)
-        valid = None if valid is None else valid.to(device)
-        batches = [slice(i, i + self.micro_batch_size) for i in range(0, len(mask), self.micro_batch_size)]
+        mask, target = (part.to(device, non_blocking=True) for part in (group.mask, group.target))
+        valid = None if group.valid is None else group.valid.to(device, non_blocking=True)
+        cut = int(self.micro_batch_size)
+        batches = [slice(i, i + cut) for i in range(0, len(mask), cut)]
 
-        canvas = torch.zeros(mask.shape, dtype=torch.promote_types(parameters[0].dtype, torch.float32), device=device)
+        canvas = self._canvas(group, device)
         graphs: dict[int, Tensor] = {}
-        with cast_frozen_once(self.model) if self.mixed_precision == "bf16" else nullcontext():
-            num_retained = self._snapshot(pixel_values, batches, canvas, graphs)
-            require_finite(canvas, "the prediction", names)
+        with self._casts or nullcontext():
+            num_retained = self._snapshot(group, batches, canvas, graphs)
             with self.phase("loss"):
-                differentiate = partial(self._differentiate, canvas, target, mask, valid)
-                loss, gradient = self._recovering(differentiate, pixel_values, graphs)
-            if not loss.total.isfinite():  # differences of finite predictions overflow; their signs do not
-                raise ValueError("the loss of this group is NaN or infinite")
-            self._add_gradients(parameters, partial(self._replay, parameters, pixel_values, batches, gradient, graphs))
-        return GroupStepOutput(*loss, forwards=2 * len(mask) - num_retained)
+                differentiate = partial(self._differentiate, canvas, target, mask, valid, group)
+                loss, gradient = self._recovering(differentiate, group, graphs)
+            backward = partial(self._replay, parameters, group, batches, gradient, graphs)
+            low, high = canvas.detach().flatten(1).aminmax(dim=1)  # both are NaN if one value is
+            finite = low.isfinite() & high.isfinite()
+            facts = [num_retained, loss.total, loss.consistency, loss.distillation, finite]
+            values = self._add_gradients(parameters, backward, facts, group)
+        kept, *terms = values[:4]
+        cpu = [torch.tensor(term, dtype=canvas.dtype) for term in terms]
+        return GroupStepOutput(*cpu, num_pairs=loss.num_pairs, forwards=2 * len(mask) - int(kept))
 
-    def _snapshot(self, pixel_values: Tensor, batches: list[slice], canvas: Tensor, graphs: dict[int, Tensor]) -> int:
+    def choose_micro_batch_size(self, group: GroupInputs, largest: int | None = None) -> int:
+        """Set and return the images per forward that memory allows, the least of all processes; at most 8 on CUDA.
+
+        The whole of the largest group, of `largest` images (default: this one), else an even number or 1. Measured
+        with one forward of two images, or of one where two are too many. Raises torch.OutOfMemoryError, on all
+        processes, where not even one fits.
+        """
+        budget = self.budget or GraphBudget(self.model, local_processes(self._world), self._casts)
+        with self._casts or nullcontext(), torch.enable_grad():
+            count = budget.measure_few(group.pixel_values, self._predict)
+        canvas = self._canvas(group, "meta")[:1].expand(largest or len(group), -1, -1)
+        chosen = count if count < min(2, len(group)) else budget.widen(group.pixel_values, count, canvas)
+        if self._world > 1:
+            chosen = int(self.accelerator.gather(torch.tensor([chosen], device=self._parameters[0].device)).min())
+        if chosen == 0:
+            raise torch.OutOfMemoryError("not even one image fits into memory")
+        budget.reserve(group.pixel_values, count, chosen, canvas)
+        self.micro_batch_size = chosen
+        return chosen
+
+    def _check_model(self) -> None:
+        """A replay must repeat its snapshot. The model is walked once, what was found is looked at for every group."""
+        if self._watched is None:
+            self._watched = list(watched(self.model))
+        for part in self._watched:
+            check_watched(*part)
+
+    def _canvas(self, group: GroupInputs, device: torch.device | str) -> Tensor:
+        """Zeros where the group's predictions belong, (N,H,W)."""
+        dtype = torch.promote_types(self._parameters[0].dtype, torch.float32)
+        return torch.zeros(group.mask.shape, dtype=dtype, device=device)
+
+    def _check_size(self, group: GroupInputs) -> None:
+        """Raise, on all processes, if the prediction's size, where it is known, is not that of mask and target."""
+        size = self._sizes.get(tuple(group.pixel_values.shape[1:]))
+        if size is not None and size != tuple(group.mask.shape[1:]):
+            raise ValueError(
+                f"the prediction is {size[0]}x{size[1]} but mask and target are {group.mask.shape[1]}x"
+                f"{group.mask.shape[2]}: resize them to the prediction's size"
+            )
+
+    def _snapshot(self, group: GroupInputs, batches: list[slice], canvas: Tensor, graphs: dict[int, Tensor]) -> Tensor:
         """Fill `canvas` (N,H,W) with all predictions, and `graphs` with this process's that kept their graph.
 
-        Returns how many images keep theirs, over all processes.
+        Returns how many images keep theirs, over all processes: (1,), on the device.
         """
-        sizes = canvas.new_zeros(len(canvas), 2)  # travels with the canvas, so that all processes raise or none
+        shape = tuple(group.pixel_values.shape[1:])
         with self.phase("snapshot"):
-            forward = partial(self._forward, pixel_values, batches, canvas, sizes, graphs)
-            self._recovering(forward, pixel_values, graphs)
-        num_retained = sum(map(len, graphs.values()))
+            self._recovering(partial(self._forward, group, batches, canvas, graphs), group, graphs)
+        num_retained = canvas.new_full((1,), sum(map(len, graphs.values())))
         if self._world > 1:
             with self.phase("reduce"):
                 # A sum of zeros and one prediction is that prediction to the bit, NaN included.
-                parts = [canvas.new_tensor([num_retained]), sizes.flatten(), canvas.flatten()]
+                parts = [num_retained, canvas.flatten()]
                 summed = self.accelerator.reduce(torch.cat(parts), "sum").split([len(part) for part in parts])
-            num_retained, sizes = int(summed[0]), summed[1].view_as(sizes)
-            canvas.copy_(summed[2].view_as(canvas))
-        for height, width in sizes.long().unique(dim=0).tolist():
-            if (height, width) != tuple(canvas.shape[-2:]):
-                raise ValueError(
-                    f"the prediction is {height}x{width} but mask and target are {canvas.shape[1]}x{canvas.shape[2]}: "
-                    "resize them to the prediction's size"
-                )
+                num_retained = summed[0]
+                canvas.copy_(summed[1].view_as(canvas))
+                if shape not in self._shared:
+                    self._share_size(shape, canvas)
+        self._check_size(group)
         return num_retained
 
-    def _forward(
-        self,
-        pixel_values: Tensor,
-        batches: list[slice],
-        canvas: Tensor,
-        sizes: Tensor,
-        graphs: dict[int, Tensor],
-    ) -> None:
-        """This process's share of the predictions and their sizes; `graphs` gets those that are retained."""
+    def _share_size(self, shape: tuple[int, ...], canvas: Tensor) -> None:
+        """What the prediction's size is for images of a shape: a process without a micro-batch has seen none."""
+        own = self._sizes.get(shape, (0, 0))
+        height, width = self.accelerator.gather(torch.tensor([own], device=canvas.device)).amax(0).tolist()
+        self._sizes[shape] = height, width
+        self._shared.add(shape)
+
+    def _forward(self, group: GroupInputs, batches: list[slice], canvas: Tensor, graphs: dict[int, Tensor]) -> None:
+        """This process's share of the predictions; `graphs` gets those that are retained."""
+        pixel_values = group.pixel_values
 
         def store(batch: slice, prediction: Tensor) -> None:
-            sizes[batch] = sizes.new_tensor(prediction.shape[-2:])
+            self._sizes[tuple(pixel_values.shape[1:])] = prediction.shape[-2], prediction.shape[-1]
             if prediction.shape == canvas[batch].shape:
                 canvas[batch] = prediction.detach()
 
@@ -203,12 +265,16 @@ class GroupStep:
         return [index for index in mine if index >= first]
 
     def _differentiate(
-        self, canvas: Tensor, target: Tensor, mask: Tensor, valid: Tensor | None
+        self, canvas: Tensor, target: Tensor, mask: Tensor, valid: Tensor | None, group: GroupInputs
     ) -> tuple[GiftLoss, Tensor]:
         """The group's loss, detached, and its gradient with respect to the (N,H,W) snapshots."""
         with torch.enable_grad():
-            leaf = canvas.requires_grad_()
-            loss = gift_loss(leaf, target, mask, self.lambda_c, self.lambda_d, valid)
+            leaf = canvas.detach().requires_grad_()
+            loss = gift_terms(leaf, target, mask, group.pairs, self.lambda_c, self.lambda_d, valid)
+            if self.first_share is None:
+                terms = (self.lambda_c * loss.consistency, self.lambda_d * loss.distillation)
+                pulls = [torch.autograd.grad(term, leaf, retain_graph=True)[0].abs().sum() for term in terms]
+                self.first_share = pulls[1] / (pulls[0] + pulls[1]).clamp(min=torch.finfo(leaf.dtype).tiny)
             (gradient,) = torch.autograd.grad(loss.total, leaf)
         terms = loss.total.detach(), loss.consistency.detach(), loss.distillation.detach()
         return GiftLoss(*terms, loss.num_pairs), gradient
@@ -216,7 +282,7 @@ class GroupStep:
     def _replay(
         self,
         parameters: list[nn.Parameter],
-        pixel_values: Tensor,
+        group: GroupInputs,
         batches: list[slice],
         gradient: Tensor,
         graphs: dict[int, Tensor],
@@ -227,14 +293,15 @@ class GroupStep:
             for p in parameters:
                 p.grad = None
             for index in self._mine(batches):
-                prediction = graphs.pop(index) if index in graphs else self._predict(pixel_values[batches[index]])
+                kept = index in graphs
+                prediction = graphs.pop(index) if kept else self._predict(group.pixel_values[batches[index]])
                 prediction.backward(gradient[batches[index]].to(prediction.dtype))
                 del prediction  # before the next forward, not after
 
         with self.phase("replay"), torch.enable_grad():
-            self._recovering(backward, pixel_values, graphs)
+            self._recovering(backward, group, graphs)
 
-    def _recovering(self, attempt: Callable[[], Result], pixel_values: Tensor, graphs: dict[int, Tensor]) -> Result:
+    def _recovering(self, attempt: Callable[[], Result], group: GroupInputs, graphs: dict[int, Tensor]) -> Result:
         """`attempt()`; when memory runs out while `graphs` are kept, drop them, halve the budget, and once more.
 
         Between exchanges with other processes, so each recovers on its own; the others wait for it.
@@ -242,32 +309,41 @@ class GroupStep:
         while True:
             try:
                 return attempt()
-            except torch.OutOfMemoryError:
+            except RuntimeError as error:
                 num_images = sum(map(len, graphs.values()))
-                if self.budget is None or not num_images:
+                if self.budget is None or not num_images or not is_out_of_memory(error):
                     raise
             # Outside of `except` the error is gone, and with it the frames whose tensors still took memory.
             graphs.clear()
-            self.budget.halve(pixel_values, num_images)
-            if torch.cuda.is_available():
-                torch.cuda.empty_cache()
+            self.budget.halve(group.pixel_values, self._canvas(group, "meta"), num_images)
+            release_memory(self._parameters[0].device)
 
-    def _add_gradients(self, parameters: list[nn.Parameter], backward: Callable[[], None]) -> None:
+    def _add_gradients(
+        self, parameters: list[nn.Parameter], backward: Callable[[], None], facts: list[Tensor], group: GroupInputs
+    ) -> list[float]:
         """Run `backward` on empty gradients, sum them over the processes, and add them to what was there.
 
-        Only this group's part is summed: what `.grad` already holds is equal on all processes.
+        Only this group's part is summed: what `.grad` already holds is equal on all processes. Returns the `facts` as
+        numbers, which this is the one place to wait for. ValueError, with `.grad` as it was, if they say that the
+        predictions, the loss or the gradients are not finite.
         """
         previous = [p.grad for p in parameters]
         for p in parameters:
             p.grad = None
         try:
             backward()
+            present = None
             if self._world > 1:
                 with self.phase("reduce"):
-                    self._sum_over_processes(parameters)
+                    present = self._sum_over_processes(parameters)
             gradients = [p.grad for p in parameters if p.grad is not None]
-            if not torch.nn.utils.get_total_norm(gradients, math.inf).isfinite():
-                raise ValueError("the gradient of this group has NaN or infinite values")
+            norm = torch.nn.utils.get_total_norm(gradients, math.inf) if gradients else facts[0]
+            everything = [*facts, norm] if present is None else [*facts, norm, present]
+            values = torch.cat([fact.reshape(-1).to(facts[1].dtype) for fact in everything]).tolist()
+            norm, has_gradient = values[4 + len(group)], values[5 + len(group) :]
+            group.check_results(values[4 : 4 + len(group)], values[1], norm)
+            for p, there in zip(parameters, has_gradient, strict=False):
+                p.grad = p.grad if there else None
         except BaseException:
             for p, old in zip(parameters, previous, strict=True):
                 p.grad = old
@@ -275,17 +351,20 @@ class GroupStep:
         for p, old in zip(parameters, previous, strict=True):
             if old is not None:
                 p.grad = old if p.grad is None else old.add_(p.grad)
+        return values
 
-    def _sum_over_processes(self, parameters: list[nn.Parameter]) -> None:
-        """One reduce for all gradients; a parameter that no process has a gradient for keeps None."""
-        has_gradient = parameters[0].new_tensor([p.grad is not None for p in parameters])
+    def _sum_over_processes(self, parameters: list[nn.Parameter]) -> Tensor:
+        """One reduce for all gradients; returns (P,) how many processes have one for each parameter."""
+        flags = [float(p.grad is not None) for p in parameters]
+        has_gradient = torch.tensor(flags, dtype=parameters[0].dtype).to(parameters[0].device, non_blocking=True)
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
         flat = torch.cat([has_gradient, *(g.flatten() for g in gradients)])
         has_gradient, *gradients = self.accelerator.reduce(flat, "sum").split(
             [len(parameters), *(p.numel() for p in parameters)]
         )
-        for p, gradient, present in zip(parameters, gradients, has_gradient.tolist(), strict=True):
-            p.grad = gradient.view_as(p).to(p.dtype, copy=True) if present else None
+        for p, gradient in zip(parameters, gradients, strict=True):
+            p.grad = gradient.view_as(p).to(p.dtype, copy=True)
+        return has_gradient
 
     def _mine(self, batches: list[slice]) -> range:
         return range(self._rank, len(batches), self._world)
@@ -296,61 +375,18 @@ class GroupStep:
         Autocast's weight cache is off: a cast made under no_grad would be reused by the replay and lose its gradient.
         Inputs need no gradient, so that layers before the first trainable one keep nothing for the backward.
         """
-        device = next(self.model.parameters()).device
+        device, shape = self._parameters[0].device, tuple(pixel_values.shape[1:])
         enabled = self.mixed_precision == "bf16"
-        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled, cache_enabled=False):
-            output = self.model(pixel_values=pixel_values.to(device, non_blocking=True))
+        try:
+            with torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled, cache_enabled=False):
+                output = self.model(pixel_values=pixel_values.to(device, non_blocking=True))
+        except RuntimeError as error:
+            # Smaller than a patch, not square ...: models say so in terms of their tensors.
+            if shape in self._sizes or is_out_of_memory(error) or not re.search(r"\b(shape|size)s?\b", str(error)):
+                raise
+            sides, why = f"{shape[1]}x{shape[2]}", str(error).splitlines()[0]
+            raise ValueError(f"the model does not take images of {sides} (height x width): {why}") from error
         prediction = output if isinstance(output, Tensor) else output.predicted_depth
         if prediction.ndim != 3 or len(prediction) != len(pixel_values):
             raise ValueError(f"the model must predict ({len(pixel_values)},H,W), got {tuple(prediction.shape)}")
         return prediction
-
-
-def _mixed_precision(model: nn.Module, accelerator: Accelerator | None) -> str:
-    if accelerator is not None:
-        precision = accelerator.mixed_precision
-    else:
-        precision = "bf16" if next(model.parameters()).device.type == "cuda" else "no"
-    if precision not in ("no", "bf16"):
-        raise ValueError(
-            f"mixed precision {precision} is not supported (a gradient scaler cannot follow a replay): use bf16 or no"
-        )
-    return precision
-
-
-def dropout_rates(model: nn.Module) -> Iterator[tuple[str, nn.Module, str]]:
-    """(module name, module, attribute) of every dropout or drop-path rate above 0, in whatever mode the model is."""
-    for name, module in model.named_modules():
-        keys = ["drop_prob", "dropout_prob", "attention_dropout"]
-        if isinstance(module, nn.modules.dropout._DropoutNd):
-            keys.append("p")
-        for key in keys:
-            rate = getattr(module, key, None)
-            if isinstance(rate, (int, float)) and rate > 0:
-                yield name or type(module).__name__, module, key
-
-
-def _check_replayable(model: nn.Module) -> None:
-    """A replay must repeat its snapshot: no dropout, no BatchNorm on batch statistics."""
-    for name, module, key in dropout_rates(model):
-        raise ValueError(f"dropout must be 0, but {name} has {key}={getattr(module, key)}")
-    for name, module in model.named_modules():
-        if isinstance(module, nn.modules.batchnorm._BatchNorm) and module.training:
-            raise ValueError(f"BatchNorm layer {name} is in training mode: call model.eval() first")
-
-
-def _check_inputs(
-    pixel_values: Tensor, mask: Tensor, target: Tensor, valid: Tensor | None, names: Sequence[str] | None
-) -> None:
-    """What `gift_loss` would refuse after the forwards, refused before them."""
-    if pixel_values.ndim != 4 or pixel_values.dtype == torch.float16:
-        raise ValueError(
-            f"pixel_values must be (N,3,h,w) and not fp16, got {tuple(pixel_values.shape)} {pixel_values.dtype}"
-        )
-    if len(pixel_values) == 0:
-        raise ValueError("the group has no images")
-    for what, tensor in (("mask", mask), ("target", target), ("valid", valid), ("names", names)):
-        if tensor is not None and len(tensor) != len(pixel_values):
-            raise ValueError(f"{what} has {len(tensor)} entries for {len(pixel_values)} images")
-    require_finite(pixel_values, "pixel_values", names)
-    require_finite(target, "the target (proxy)", names)

@@ -17,6 +17,10 @@ from torch import Tensor
 # Values per temporary tensor of the pairwise sums: 4 MiB in float32, near enough to a cache and to a GPU's appetite.
 BLOCK_ELEMENTS = 2**20
 
+# Differences to a proxy up to this share of its image's largest |value| count as none: the sign of what another cut
+# into batches or number of threads changes is noise, and a fresh adapter would get a whole gradient of it.
+ROUNDING = {torch.float32: 2.0**-18, torch.float64: 2.0**-46}
+
 
 class GiftLoss(NamedTuple):
     """What `gift_loss` returns; the two terms are before their lambdas, the factor 2 of Eq. 5 included."""
@@ -53,14 +57,15 @@ def group_consistency_loss(depth: Tensor, mask: Tensor, valid: Tensor | None = N
     Raises ValueError for wrong dtypes or shapes and non-finite values.
     """
     depth = _check_group(depth, mask, valid)
-    return _consistency(depth, _target_region(mask, valid))[0]
+    return _consistency(depth, Pairs.of(mask, valid))
 
 
 def self_distillation_loss(depth: Tensor, target: Tensor, mask: Tensor, valid: Tensor | None = None) -> Tensor:
     """Twice the mean over images of the L1 distance to the frozen model's prediction outside the target (Eq. 5).
 
     Args: as `group_consistency_loss`; `target` (N,H,W) proxies, treated as constants. Images without other-region
-    pixels do not count. Returns a 0-dim tensor; 0, with zero gradients, if none counts. Raises ValueError likewise.
+    pixels do not count; differences up to 2^-18 of the image's largest |target| (float64: 2^-46) are rounding and
+    count as none. Returns a 0-dim tensor; 0, with zero gradients, if none counts. Raises ValueError likewise.
     """
     depth, target = _check_group_and_target(depth, target, mask, valid)
     return _distillation(depth, target, _other_region(mask, valid))
@@ -79,10 +84,64 @@ def gift_loss(
     Args: `depth`, `target` (N,H,W) float, `mask`, `valid` (N,H,W) bool. Raises ValueError for wrong dtypes or shapes
     and non-finite values. `num_pairs` counts the pairs behind the consistency term.
     """
-    depth, target = _check_group_and_target(depth, target, mask, valid)
-    consistency, num_pairs = _consistency(depth, _target_region(mask, valid))
-    distillation = _distillation(depth, target, _other_region(mask, valid))
-    return GiftLoss(lambda_c * consistency + lambda_d * distillation, consistency, distillation, num_pairs)
+    _check_group_and_target(depth, target, mask, valid)
+    return gift_terms(depth, target, mask, Pairs.of(mask, valid), lambda_c, lambda_d, valid)
+
+
+def gift_terms(
+    depth: Tensor,
+    target: Tensor,
+    mask: Tensor,
+    pairs: Pairs,
+    lambda_c: float = 1.0,
+    lambda_d: float = 1.0,
+    valid: Tensor | None = None,
+) -> GiftLoss:
+    """`gift_loss` without its checks, of pairs found beforehand: nothing here waits for the device.
+
+    NaN in, NaN out.
+    """
+    depth, target = _promote(depth, target)
+    consistency = _consistency(depth, pairs)
+    distillation = _distillation(depth, target.detach(), _other_region(mask, valid))
+    return GiftLoss(lambda_c * consistency + lambda_d * distillation, consistency, distillation, pairs.num_pairs)
+
+
+class Pairs(NamedTuple):
+    """All of Eq. 2 that target regions alone decide, on the CPU: which pixels count in which pair.
+
+    Args:
+        columns (`Tensor`): (K,) int64, the pixels, out of H*W, that at least two regions hold.
+        mask (`Tensor`): (N, K) bool, which region holds them.
+        count (`Tensor`): (N, N) int64, pixels in each pair's intersection; on the diagonal those of `mask`.
+        sizes (`Tensor`): (N,) int64, pixels of each region.
+    """
+
+    columns: Tensor
+    mask: Tensor
+    count: Tensor
+    sizes: Tensor
+
+    @classmethod
+    def of(cls, mask: Tensor, valid: Tensor | None = None) -> Pairs:
+        """Of a group's `mask` (N,H,W) and `valid`, bool."""
+        region = _target_region(mask, valid).flatten(1).cpu()
+        columns = (region.sum(0) >= 2).nonzero()[:, 0]
+        shared = region[:, columns]
+        count = torch.zeros(len(region), len(region), dtype=torch.int64)
+        for part in shared.split(_block_length(len(region)), dim=1):
+            ones = part.float()
+            count += (ones @ ones.T).long()  # sums of less than 2**24 ones: exact
+        return cls(columns, shared, count, region.sum(1))
+
+    @property
+    def num_pairs(self) -> int:
+        """Pairs with a non-empty intersection."""
+        return int(self.count.triu(1).count_nonzero())
+
+    def pin_memory(self) -> Pairs:
+        """The same in pinned memory, from where it travels to a CUDA device while the host goes on."""
+        return Pairs(*(part.pin_memory() for part in self))
 
 
 class GeometryConsistencyError:
@@ -104,12 +163,12 @@ class GeometryConsistencyError:
         Shapes, units and errors as `group_consistency_loss`.
         """
         with torch.no_grad():
-            depth = _check_group(depth, mask, valid)
-            loss, num_pairs = _consistency(depth, _target_region(mask, valid))
-        if num_pairs == 0:
+            depth, pairs = _check_group(depth, mask, valid), Pairs.of(mask, valid)
+        if pairs.num_pairs == 0:
             self.num_skipped += 1
             return math.nan
-        value = loss.item()
+        with torch.no_grad():
+            value = _consistency(depth, pairs).item()
         spread = prediction_spread(depth, valid)
         self.num_groups += 1
         self._sum += value
@@ -156,47 +215,53 @@ def require_finite(values: Tensor, what: str, names: Sequence[str] | None = None
 
 
 class _PairwiseL1(torch.autograd.Function):
-    """Sum over pairs of the mean absolute difference on each pair's intersection, and the number of such pairs.
+    """Sum over pairs of the mean absolute difference on each pair's intersection.
 
-    `depth`, `mask` (N,P). Pixels that fewer than two masks hold are left out; the others are gathered block by block,
-    so that beside `gradient` (N,P), which is built with the value, the temporary memory does not depend on N or P.
+    `depth` (N,P). Pixels that fewer than two masks hold are left out; the others are gathered block by block, so that
+    beside `gradient` (N,P), which is built with the value, the temporary memory does not depend on N or P.
     """
 
     @staticmethod
-    def forward(ctx, depth: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        blocks = (mask.sum(0) >= 2).nonzero()[:, 0].split(max(1, BLOCK_ELEMENTS // len(mask)))
-        count = torch.zeros(len(mask), len(mask), dtype=torch.float64, device=mask.device)
-        for columns in blocks:
-            ones = mask[:, columns].float()
-            count += ones @ ones.T  # sums of less than 2**24 ones: exact
-        weight = torch.where(count > 0, 1 / count, 0).to(depth.dtype)
+    def forward(ctx, depth: Tensor, pairs: Pairs) -> Tensor:
+        def there(part: Tensor) -> Tensor:
+            return part.to(depth.device, non_blocking=True)
+
+        count = there(pairs.count)
+        weight = torch.where(count > 0, count.to(depth.dtype).reciprocal(), 0)
+        columns, mask, length = there(pairs.columns), there(pairs.mask), _block_length(len(depth))
         total = depth.new_zeros(())
         gradient = torch.zeros_like(depth) if depth.requires_grad else None
-        for columns in blocks:
-            value, signs = _pair_sums(depth[:, columns], mask[:, columns], weight, gradient is not None)
+        for start in range(0, len(columns), length):
+            block = slice(start, start + length)
+            uniform = bool(pairs.mask[:, block].all())  # the usual case: one mask for the whole group
+            part = None if uniform else mask[:, block]
+            value, signs = _pair_sums(depth[:, columns[block]], part, weight, gradient is not None)
             total += value
             if gradient is not None and signs is not None:
-                gradient[:, columns] = signs
+                gradient[:, columns[block]] = signs
         ctx.save_for_backward(gradient)
-        num_pairs = count.triu(1).count_nonzero()
-        ctx.mark_non_differentiable(num_pairs)
-        return total, num_pairs
+        return total
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, grad_total: Tensor, _) -> tuple[Tensor, None]:
+    def backward(ctx, grad_total: Tensor) -> tuple[Tensor, None]:
         (gradient,) = ctx.saved_tensors
         return gradient * grad_total, None
 
 
-def _pair_sums(depth: Tensor, mask: Tensor, weight: Tensor, differentiate: bool) -> tuple[Tensor, Tensor | None]:
-    """The weighted sum over pairs of (N,K) columns, and its gradient (N,K)."""
+def _block_length(num_images: int) -> int:
+    return max(1, BLOCK_ELEMENTS // num_images)
+
+
+def _pair_sums(
+    depth: Tensor, mask: Tensor | None, weight: Tensor, differentiate: bool
+) -> tuple[Tensor, Tensor | None]:
+    """The weighted sum over pairs of (N,K) columns, and its gradient (N,K); no `mask` where all hold all of them."""
     total = depth.new_zeros(())
     gradient = torch.zeros_like(depth) if differentiate else None
-    same = bool(mask.all())  # the usual case: one mask for the whole group
     for i in range(len(depth) - 1):
         difference = depth[i] - depth[i + 1 :]
-        if not same:  # where, not a product: an overflow outside the masks would turn 0 * inf into NaN
+        if mask is not None:  # where, not a product: an overflow outside the masks would turn 0 * inf into NaN
             difference = torch.where(mask[i] & mask[i + 1 :], difference, 0)
         if gradient is not None:
             sign = difference.sign()
@@ -209,13 +274,14 @@ def _pair_sums(depth: Tensor, mask: Tensor, weight: Tensor, differentiate: bool)
 class _DistanceToTarget(torch.autograd.Function):
     """Per image the mean absolute difference to `target` on `region`, 0 where that is empty; all (N,P).
 
-    Image by image in both directions: autograd would keep and make several (N,P) tensors.
+    Image by image in both directions: autograd would keep and make several (N,P) tensors. Differences up to
+    `ROUNDING` count as none.
     """
 
     @staticmethod
     def forward(ctx, depth: Tensor, target: Tensor, region: Tensor, count: Tensor) -> Tensor:
         ctx.save_for_backward(depth, target, region, count)
-        sums = [torch.where(r, d - t, 0).abs_().sum() for d, t, r in zip(depth, target, region, strict=True)]
+        sums = [_beyond_rounding(*image).abs_().sum() for image in zip(depth, target, region, strict=True)]
         return torch.stack(sums) / count.clamp(min=1)
 
     @staticmethod
@@ -224,14 +290,20 @@ class _DistanceToTarget(torch.autograd.Function):
         depth, target, region, count = ctx.saved_tensors
         gradient = torch.empty_like(depth)
         for i, scale in enumerate(grad_output / count.clamp(min=1)):
-            gradient[i] = torch.where(region[i], depth[i] - target[i], 0).sign_().mul_(scale)
+            gradient[i] = _beyond_rounding(depth[i], target[i], region[i]).sign_().mul_(scale)
         return gradient, None, None, None
 
 
-def _consistency(depth: Tensor, region: Tensor) -> tuple[Tensor, int]:
-    """Eq. 3 on checked tensors, and the number of pairs in Eq. 2."""
-    total, num_pairs = _PairwiseL1.apply(depth.flatten(1), region.flatten(1))
-    return total / num_pairs.clamp(min=1), int(num_pairs)
+def _beyond_rounding(depth: Tensor, target: Tensor, region: Tensor) -> Tensor:
+    """(P,) of one image: the difference on the region, 0 elsewhere and where it is rounding."""
+    difference = torch.where(region, depth - target, 0)
+    limit = target.abs().amax() * ROUNDING[depth.dtype]
+    return difference.masked_fill_(difference.abs() <= limit, 0)
+
+
+def _consistency(depth: Tensor, pairs: Pairs) -> Tensor:
+    """Eq. 3 on checked tensors."""
+    return _PairwiseL1.apply(depth.flatten(1), pairs) / max(1, pairs.num_pairs)
 
 
 def _distillation(depth: Tensor, target: Tensor, region: Tensor) -> Tensor:

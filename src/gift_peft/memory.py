@@ -5,15 +5,15 @@ CUDA all that is free less a margin, halved whenever it proves too much; on CPU 
 there a process that takes too much is killed, not told.
 
 Casts: autocast casts every weight again in each forward, and a graph that is retained keeps its casts: of Depth
-Anything V2-Large, 0.6 GB for each micro-batch. Its own cache holds weights that are trained only. `cast_frozen_once`
+Anything V2-Large, 0.6 GB for each micro-batch. Its own cache holds weights that are trained only. `FrozenCasts`
 gives frozen layers one cast for the whole group, with the bits of autocast's casts.
 """
 
 import logging
 import math
 import os
+import weakref
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,24 @@ logger = logging.getLogger(__name__)
 CUDA_MARGIN = 0.1  # of the device's memory: fragments, and what libraries take for themselves
 CPU_SHARE = 0.5  # of what is available
 GROUP_TENSORS = 6  # of the size of the group's predictions live beside the graphs: snapshots, gradient and its parts
+CUDA_MOST_IMAGES = 8  # per forward: enough that the device, and not the host that launches its kernels, sets the pace
+PATIENCE = 50  # groups until a budget that proved too much is measured anew; after each next time twice as many
+
+# What libraries say who ask the system for memory themselves; PyTorch's own allocator raises OutOfMemoryError.
+OUT_OF_MEMORY = ("out of memory", "alloc_failed", "can't allocate memory", "not enough memory", "cudnn_status_")
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory ran out: of PyTorch, cuBLAS, cuDNN, NCCL, the driver or the system."""
+    if isinstance(error, torch.OutOfMemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(text in str(error).lower() for text in OUT_OF_MEMORY)
+
+
+def release_memory(device: torch.device) -> None:
+    """Hand back what PyTorch keeps of a CUDA device's memory for later."""
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
 
 
 class GraphBudget:
@@ -37,19 +55,31 @@ class GraphBudget:
         num_local_processes: how many processes share the CPU's memory.
     """
 
-    def __init__(self, model: nn.Module, num_local_processes: int = 1) -> None:
+    def __init__(self, model: nn.Module, num_local_processes: int = 1, casts: "FrozenCasts | None" = None) -> None:
         self.bytes: int | None = None
         self._model = model
         self._num_local_processes = num_local_processes
+        self._casts = casts
         self._image_bytes: dict[tuple[int, ...], int] = {}  # by the shape of an image
+        self._patience = PATIENCE
+        self._until_anew = 0  # groups; 0 where nothing proved too much
 
     def knows(self, pixel_values: Tensor) -> bool:
-        """Whether the graph of an image like these (N,3,h,w) was measured."""
+        """Whether the graph of an image like these (N,3,h,w) was measured; asked once per group.
+
+        Not after a while in which less was kept than once fitted: what took the memory may be gone.
+        """
+        if self._until_anew:
+            self._until_anew -= 1
+            if not self._until_anew:
+                self.bytes = None
+                self._image_bytes.clear()
         return tuple(pixel_values.shape[1:]) in self._image_bytes
 
     def measure(self, pixel_values: Tensor, forward: Callable[[Tensor], Tensor]) -> Tensor:
         """`forward` of a micro-batch (B,3,h,w), which keeps its graph; what that takes is the measure."""
-        prediction, size = graph_bytes(self._model, lambda: forward(pixel_values), pixel_values)
+        casts = self._casts.tensors if self._casts else lambda: []
+        prediction, size = graph_bytes(self._model, lambda: forward(pixel_values), pixel_values, shared=casts)
         self._image_bytes[tuple(pixel_values.shape[1:])] = max(1, math.ceil(size / len(pixel_values)))
         if self.bytes is None:
             # This graph is already taken from what is free; a replay needs as much, and its backward once more.
@@ -57,16 +87,48 @@ class GraphBudget:
             logger.info("%s", self)
         return prediction
 
+    def measure_few(self, pixel_values: Tensor, forward: Callable[[Tensor], Tensor]) -> int:
+        """`measure` with two images, or one where two are too many; returns how many these were, 0 if not one fits."""
+        for count in range(min(2, len(pixel_values)), 0, -1):
+            try:
+                self.measure(pixel_values[:count], forward)
+                return count
+            except RuntimeError as error:
+                if not is_out_of_memory(error):
+                    raise
+            release_memory(next(self._model.parameters()).device)
+        return 0
+
     def images(self, pixel_values: Tensor, canvas: Tensor) -> int:
         """How many of these images' graphs may be kept, beside their predictions `canvas` (N,H,W)."""
         room = (self.bytes or 0) - GROUP_TENSORS * canvas.nbytes
         return max(0, room // self._image_bytes[tuple(pixel_values.shape[1:])])
 
-    def halve(self, pixel_values: Tensor, num_images: int) -> None:
-        """The graphs of so many images were too much: at most half as many from now on."""
-        self.bytes = self._image_bytes[tuple(pixel_values.shape[1:])] * num_images // 2
+    def widen(self, pixel_values: Tensor, measured: int, canvas: Tensor) -> int:
+        """The micro-batch that memory allows: the whole of the largest group, else an even number or 1; on CUDA <= 8.
+
+        `measured` images had the micro-batch whose graph was measured. Larger ones, where they are replayed, need more
+        beside the graphs that are kept: `reserve` takes that off. `canvas` as in `images`, of the largest group.
+        """
+        on_cuda = next(self._model.parameters()).device.type == "cuda"
+        return micro_batch_for(self.images(pixel_values, canvas), measured, len(canvas), on_cuda)
+
+    def reserve(self, pixel_values: Tensor, measured: int, count: int, canvas: Tensor) -> None:
+        """Set aside what micro-batches of `count` images take where groups are too large to be kept whole."""
+        if count < len(canvas):
+            more = 2 * max(0, count - measured) * self._image_bytes[tuple(pixel_values.shape[1:])]
+            self.bytes = max(0, (self.bytes or 0) - more)
+
+    def halve(self, pixel_values: Tensor, canvas: Tensor, num_images: int) -> None:
+        """The graphs of so many images were too much: at most half as many for a while."""
+        room = self._image_bytes[tuple(pixel_values.shape[1:])] * (num_images // 2) + GROUP_TENSORS * canvas.nbytes
+        self.bytes = min(self.bytes or room, room) if num_images > 1 else 0
+        self._until_anew, self._patience = self._patience, 2 * self._patience
         logger.warning(
-            "out of memory with the graphs of %d images; keeping at most %d from now on", num_images, num_images // 2
+            "out of memory with the graphs of %d images; keeping at most %d for the next %d groups",
+            num_images,
+            num_images // 2,
+            self._until_anew,
         )
 
     def __str__(self) -> str:
@@ -89,8 +151,28 @@ class GraphBudget:
         return 0  # elsewhere nobody tells how much is free
 
 
-def graph_bytes(model: nn.Module, forward: Callable[[], Tensor], *alive: Tensor) -> tuple[Tensor, int]:
-    """(prediction, bytes its graph keeps alive beside the model's weights and `alive`) of a forward with grad."""
+def micro_batch_for(room: int, measured: int, largest: int, on_cuda: bool) -> int:
+    """Images per forward where `room` graphs may be kept beside a micro-batch of `measured` images.
+
+    What a replay of more takes, its graph and as much for the backward, is not there for graphs to keep. On a CPU all
+    of the room may go into that; on CUDA a quarter, because there larger batches save launches only.
+    """
+    if largest > room:
+        more = room // (8 if on_cuda else 2)
+        largest = (measured + more) // 2 * 2 or 1
+    return min(largest, CUDA_MOST_IMAGES) if on_cuda else largest
+
+
+def graph_bytes(
+    model: nn.Module,
+    forward: Callable[[], Tensor],
+    *alive: Tensor,
+    shared: Callable[[], list[Tensor]] = lambda: [],
+) -> tuple[Tensor, int]:
+    """(prediction, bytes its graph keeps alive beside the model's weights and `alive`) of a forward with grad.
+
+    `shared` gives, afterwards, what the forward has made that the graphs of other images share.
+    """
     device = next(model.parameters()).device
     if device.type == "cuda":
         with torch.no_grad():
@@ -107,7 +189,7 @@ def graph_bytes(model: nn.Module, forward: Callable[[], Tensor], *alive: Tensor)
 
     with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
         prediction = forward()
-    for tensor in (*model.parameters(), *model.buffers(), *alive):
+    for tensor in (*model.parameters(), *model.buffers(), *alive, *shared()):
         sizes.pop(tensor.untyped_storage().data_ptr(), None)
     return prediction, sum(sizes.values()) + prediction.nbytes
 
@@ -157,42 +239,69 @@ def local_processes(num_processes: int) -> int:
 LAYERS = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d)  # what autocast runs in half precision, and these models have
 
 
-@contextmanager
-def cast_frozen_once(model: nn.Module, dtype: torch.dtype = torch.bfloat16) -> Iterator[None]:
-    """Inside, frozen float32 layers share one cast of their weight over all forwards and backwards under autocast.
+class FrozenCasts:
+    """Frozen float32 layers that share one cast of their weight over all forwards and backwards of a group.
 
-    A layer has the cast during its own forward only: what runs outside of autocast, and code that asks for the type of
-    its weight, find it unchanged. Compiled blocks are left alone.
+    `with casts:` around what runs under autocast; outside of it nothing changes, and nothing is kept. A layer has the
+    cast during its own forward only: what runs outside of autocast, and code that asks for the type of its weight,
+    find it unchanged. Compiled blocks are left alone. The model is walked once; its hooks go with this object.
     """
-    casts: dict[nn.Module, Tensor] = {}
-    weights: dict[nn.Module, nn.Parameter] = {}
 
-    def lend(module: Any, args: tuple) -> None:
+    def __init__(self, model: nn.Module, dtype: torch.dtype = torch.bfloat16) -> None:
+        self._hooks = hooks = _CastHooks(dtype)
+        handles = []
+        for module in _uncompiled_modules(model):
+            if type(module) in LAYERS and module.weight.dtype == torch.float32 and not module.weight.requires_grad:
+                handles.append(module.register_forward_pre_hook(hooks.lend))
+                handles.append(module.register_forward_hook(hooks.take_back, always_call=True))  # also after an error
+        weakref.finalize(self, _remove, handles)
+
+    def __enter__(self) -> "FrozenCasts":
+        self._hooks.active = True
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._hooks.active = False
+        self._hooks.casts.clear()
+
+    def tensors(self) -> list[Tensor]:
+        """The casts that there are now."""
+        return list(self._hooks.casts.values())
+
+
+class _CastHooks:
+    """What the layers call; apart from `FrozenCasts`, so that a model with hooks does not keep that alive."""
+
+    def __init__(self, dtype: torch.dtype) -> None:
+        self.dtype, self.active = dtype, False
+        self.casts: dict[nn.Module, Tensor] = {}
+        self._weights: dict[nn.Module, nn.Parameter] = {}
+
+    def lend(self, module: Any, args: tuple) -> None:
         weight = module.weight
-        if torch.is_autocast_enabled(weight.device.type):
-            if module not in casts:
-                casts[module] = weight.detach().to(dtype)
-            weights[module] = weight
-            module._parameters["weight"] = casts[module]
+        if self.active and torch.is_autocast_enabled(weight.device.type):
+            if module not in self.casts:
+                self.casts[module] = weight.detach().to(self.dtype)
+            self._weights[module] = weight
+            module._parameters["weight"] = self.casts[module]
 
-    def take_back(module: Any, args: tuple, output: object) -> None:
-        if module in weights:
-            module._parameters["weight"] = weights.pop(module)
+    def take_back(self, module: Any, args: tuple, output: object) -> None:
+        if module in self._weights:
+            module._parameters["weight"] = self._weights.pop(module)
 
-    handles = []
-    for module in _uncompiled_modules(model):
-        if type(module) in LAYERS and module.weight.dtype == torch.float32 and not module.weight.requires_grad:
-            handles.append(module.register_forward_pre_hook(lend))
-            handles.append(module.register_forward_hook(take_back, always_call=True))  # also after an error
-    try:
-        yield
-    finally:
-        for handle in handles:
-            handle.remove()
+
+def _remove(handles: list) -> None:
+    for handle in handles:
+        handle.remove()
 
 
 def _uncompiled_modules(module: nn.Module) -> Iterator[nn.Module]:
-    if module._compiled_call_impl is None:
+    if not is_compiled(module):
         yield module
         for child in module.children():
             yield from _uncompiled_modules(child)
+
+
+def is_compiled(module: nn.Module) -> bool:
+    """Whether `torch.compile` stands before the module or its forward."""
+    return module._compiled_call_impl is not None or hasattr(module.forward, "_torchdynamo_orig_callable")

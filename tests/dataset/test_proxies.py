@@ -205,6 +205,23 @@ def test_a_proxy_file_that_lacks_an_image(raw_tree, base_dir):
     one_line(excinfo, f"damaged proxy {path} (it holds 2 of 3 proxies)", "gift-peft proxies")
 
 
+def test_one_flipped_bit_in_a_proxy_is_noticed(raw_tree, base_dir):
+    folder = make_proxies(base_dir, raw_tree, size=SIZE)
+    for name in ("proxies", "reference"):
+        path = folder / "validation/scene_100.safetensors"
+        whole = path.read_bytes()
+        with safetensors.safe_open(path, "pt") as file:
+            metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        bits = tensors[name].view(torch.int32)
+        bits.view(-1)[7] ^= 1 << 5  # finite still, and near to what it was
+        path.write_bytes(safetensors.torch.save(tensors, metadata))
+        with pytest.raises(ValueError) as excinfo:
+            load_gift_i(raw_tree, "validation", teacher=base_dir)[0]
+        one_line(excinfo, f"damaged proxy {path} (values of {name} have changed", "gift-peft proxies", "--overwrite")
+        path.write_bytes(whole)
+    load_gift_i(raw_tree, "validation", teacher=base_dir)[0]
+
+
 def test_damaged_and_nan_proxies(raw_tree, base_dir):
     path = make_proxies(base_dir, raw_tree, size=SIZE) / "validation/scene_100.safetensors"
     tensors, header = safetensors.torch.load_file(path), read_header(path)

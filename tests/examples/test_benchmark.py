@@ -5,10 +5,13 @@ import math
 import os
 import subprocess
 import sys
+import weakref
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from helpers.group_tools import group, toy
 from helpers.runs import arguments
 
 from gift_peft.training import train
@@ -63,6 +66,30 @@ def test_models_have_the_released_sizes(modules, name, millions):
     with torch.device("meta"):
         model = modules[1].CONFIGS[name].build()
     assert sum(p.numel() for p in model.parameters()) / 1e6 == pytest.approx(millions, abs=0.05)
+
+
+def test_options_are_timed_with_one_model_at_a_time(modules, monkeypatch):
+    """Beside the benchmark's own; a 24 GB card could not hold five of VGGT."""
+    import benchmark_group_step as script
+
+    alive, made = weakref.WeakSet(), []
+
+    def make(base):
+        assert not alive
+        made.append(None)
+        model = toy()
+        alive.add(model)
+        return model
+
+    monkeypatch.setattr(script, "get_gift_model", make)
+    monkeypatch.setattr(script, "load_base", lambda base: (None, None))
+    for name in ("checkpoint_blocks", "use_channels_last"):
+        monkeypatch.setattr(script, name, lambda model: None)
+    pixels, mask, target, _ = group(3, torch.float32)
+    some = SimpleNamespace(pixel_values=pixels, mask=mask, target=target)
+    bench = SimpleNamespace(base="", device=torch.device("cpu"), accelerator=None, index={3: 0}, groups=[some])
+    seconds = script.measure_options(bench, 3, 1, compiled=False)
+    assert len(made) == len(seconds) == 4 and all(value > 0 for value in seconds.values())
 
 
 def test_flops_of_a_linear_layer():

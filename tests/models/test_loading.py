@@ -1,5 +1,6 @@
 """`DepthModel`: what `predict` writes is what transformers' pipeline gives, whatever the backbone; pictures; kinds."""
 
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,11 +9,13 @@ import torch
 from helpers.backbones import picture, tiny_metric3d, tiny_vggt
 from helpers.tiny import SIZE, tiny_model, tiny_processor
 from PIL import Image
+from safetensors.torch import load_file
 from transformers import pipeline
 
 from gift_peft import DepthModel
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import get_gift_model
+from gift_peft.models.loading import load_base
 from gift_peft.models.metric3d.image_processing_metric3d import Metric3DImageProcessorPil
 from gift_peft.models.vggt.image_processing_vggt import VggtImageProcessorPil
 from gift_peft.predict import predict_images
@@ -156,3 +159,27 @@ def test_the_teacher_is_the_base_of_a_network_without_an_adapter():
     pixels = torch.randn(3, 3, *SIZE, generator=torch.Generator().manual_seed(0))
     assert model.adapted and torch.equal(model.predict_base(pixels), DepthModel(tiny_model()).predict(pixels))
     assert torch.equal(model.predict(pixels), DepthModel(tiny_model(1)).predict_base(pixels))
+
+
+def test_weights_come_from_safetensors_only(base_dir, tmp_path):
+    folder = shutil.copytree(base_dir, tmp_path / "base")
+    torch.save(load_file(folder / "model.safetensors"), folder / "pytorch_model.bin")
+    (folder / "model.safetensors").unlink()
+    with pytest.raises(ValueError, match=r"pickled weights only \(\.bin\); take safetensors") as error:
+        load_base(folder)
+    assert "\n" not in str(error.value)
+
+
+def test_predictions_are_made_without_tf32():
+    """As far as one can see without a GPU: what cuDNN and cuBLAS are told during a forward, and after it."""
+    parts = (torch.backends.cudnn.conv, torch.backends.cuda.matmul)
+    before, seen = [part.fp32_precision for part in parts], []
+    assert before[0] == "tf32"  # PyTorch's default
+
+    def network(pixel_values):
+        seen.extend(part.fp32_precision for part in parts)
+        return pixel_values[:, 0]
+
+    DepthModel(network, size=(4, 6)).predict(torch.zeros(1, 3, 4, 6))
+    assert seen == ["ieee", "ieee"] and [part.fp32_precision for part in parts] == before
+    assert torch.backends.cudnn.allow_tf32  # asked in the old way it still answers

@@ -1,13 +1,22 @@
 """What makes a step faster or smaller: the same gradient, and where not, how near."""
 
+from functools import partial
+
 import pytest
 import torch
 from helpers.group_tools import SIZE, gift_model, gradients, group, largest_error, step_gradients
 from torch import nn
 
 from gift_peft.adapters.recipes import get_gift_model
-from gift_peft.memory import graph_bytes
-from gift_peft.training.speed import checkpoint_blocks, compile_blocks, encoder_blocks, make_adam, use_channels_last
+from gift_peft.memory import graph_bytes, is_compiled
+from gift_peft.training.speed import (
+    checkpoint_blocks,
+    compile_blocks,
+    encoder_blocks,
+    make_adam,
+    tuned_for,
+    use_channels_last,
+)
 
 
 def relative_l2(got, want):
@@ -64,6 +73,23 @@ def test_channels_last_changes_the_trained_head_only():
         assert torch.equal(model(pixel_values=data[0]).predicted_depth, teacher)
 
 
+@pytest.mark.parametrize(
+    ("device", "asked", "head", "expected"),
+    [
+        ("cpu", None, "full", False),
+        ("cpu", True, "full", True),
+        ("cuda", None, "full", True),
+        ("cuda", None, "lora", False),
+        ("cuda", False, "full", False),
+        ("cuda", True, "lora", True),  # refused when the model is made
+    ],
+)
+def test_channels_last_by_device(device, asked, head, expected, monkeypatch):
+    monkeypatch.setattr(torch.backends.cudnn, "benchmark", False)
+    assert tuned_for(torch.device(device), asked, head) is expected
+    assert torch.backends.cudnn.benchmark is (device == "cuda")
+
+
 def test_channels_last_wants_a_head_that_is_trained(model):
     with pytest.raises(ValueError, match="head: full"):
         use_channels_last(get_gift_model(model, head="lora"))
@@ -101,6 +127,36 @@ def test_compiled_blocks_give_the_same_gradient(dtype, tolerance):
         assert relative_l2(got, want) < tolerance
     assert [name for name, _ in model.named_parameters()] == names
     assert gradients(model).keys() == want.keys()
+
+
+def test_compiled_blocks_are_one_graph_with_the_same_bits_for_batches_of_any_size(monkeypatch):
+    """Without code generation (aot_eager): what Dynamo sees is the point."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
+    model = gift_model(torch.float32)
+    names = [name for name, _ in model.named_parameters()]
+    batches = {count: group(count, torch.float32)[0] for count in (2, 3, 1, 4, 5, 7, 9)}
+
+    def predict(pixels):
+        with torch.no_grad():
+            exact = model(pixel_values=pixels).predicted_depth
+        with torch.autocast("cpu", torch.bfloat16):
+            return exact, model(pixel_values=pixels).predicted_depth.detach()
+
+    want = {count: predict(pixels) for count, pixels in batches.items()}
+    torch._dynamo.reset()
+    counters = torch._dynamo.utils.counters
+    counters.clear()
+    compile_blocks(model)
+    graphs = []
+    for count, pixels in batches.items():
+        for got, expected in zip(predict(pixels), want[count], strict=True):
+            assert torch.equal(got, expected)
+        graphs.append(counters["stats"]["unique_graphs"])
+    assert not counters["graph_break"]
+    assert graphs[0] >= 2 and graphs[2:] == [graphs[2]] * 5  # after two sizes and a single image none is added
+    assert [name for name, _ in model.named_parameters()] == names
+    assert all(is_compiled(block) for block in encoder_blocks(model))
+    torch._dynamo.reset()
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-3)])

@@ -17,7 +17,7 @@ from peft import LoraConfig, PeftModel, get_peft_model
 from torch import nn
 
 from gift_peft.adapters.scale import check_lora_config
-from gift_peft.group_step import dropout_rates
+from gift_peft.replayable import dropout_rates
 from gift_peft.rules import KINDS
 
 HEADS = ("full", "lora", "none")

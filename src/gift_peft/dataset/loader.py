@@ -39,13 +39,21 @@ class PreparedGroups:
         processor, size: as for `collate_group`.
         num_threads: groups prepared ahead; 0 prepares each when it is asked for.
         cache_dir: of `GroupCache`; None decodes every time.
+        pin: into pinned memory, from where tensors travel to a CUDA device while the host goes on.
     """
 
     def __init__(
-        self, dataset, processor, size: tuple[int, int], num_threads: int = 2, cache_dir: Path | None = None
+        self,
+        dataset,
+        processor,
+        size: tuple[int, int],
+        num_threads: int = 2,
+        cache_dir: Path | None = None,
+        pin: bool = False,
     ) -> None:
         self.dataset = dataset
         self.num_threads = num_threads
+        self.pin = pin
         self._cache = GroupCache(dataset, processor, size, cache_dir)
 
     def __len__(self) -> int:
@@ -61,8 +69,10 @@ class PreparedGroups:
     def read(self, index: int, image: int | None = None) -> Group:
         """`GroupCache.read`: a group, or one image of it."""
         group = self._cache.read(index, image)
-        if torch.cuda.is_available():  # a pinned tensor travels while the device computes
-            group.pixel_values = group.pixel_values.pin_memory()
+        if self.pin:
+            for name in ("pixel_values", "mask", "valid", "target", "surface_target"):
+                if (tensor := getattr(group, name)) is not None:
+                    setattr(group, name, tensor.pin_memory())
         return group
 
     def take(self, indices: Iterable[int]) -> Iterator[Group]:

@@ -2,8 +2,9 @@
 
 `proxies/<teacher>/<h>x<w>/<split>/<group_id>.safetensors` holds `proxies` (N, h, w) float32 in image order and, where
 the group has a treated reference, `reference` (h, w): sets of several sizes lie side by side. The header names the
-teacher, its revision, the size, the image processor's settings and a digest of every image's decoded content: a proxy
-of other weights or pixels is never used. Sets of 0.1.0, which lie one folder higher, are read where their size fits.
+teacher, its revision, the size, the image processor's settings and a digest of every image's decoded content and of
+its values: a proxy of other weights or pixels, or a damaged one, is never used. Sets of 0.1.0, which lie one folder
+higher, are read where their size fits.
 
 `<group_id>.surface.safetensors` beside it holds the surface targets, `target` and `target_flipped` (N, h, w) float32,
 the second in the orientation of the flipped photo. Its header states that besides the masks and how it was made.
@@ -142,8 +143,19 @@ def _write(path: Path, header: dict, tensors: dict[str, torch.Tensor]) -> None:
     import safetensors.torch
 
     tensors = {name: tensor.float().contiguous() for name, tensor in tensors.items()}
+    digests = {name: [_digest(part) for part in _entries(tensor)] for name, tensor in tensors.items()}
+    header = {**header, "values": digests}
     # One entry, because safetensors writes several in random order, and equal proxies shall be equal files.
     write_whole(path, safetensors.torch.save(tensors, metadata={METADATA: json.dumps(header, sort_keys=True)}))
+
+
+def _entries(tensor: torch.Tensor) -> list[torch.Tensor]:
+    """The (h, w) parts of what has an entry per image, or of one image."""
+    return list(tensor.reshape(-1, *tensor.shape[-2:]))
+
+
+def _digest(values: torch.Tensor) -> str:
+    return hashlib.blake2b(values.contiguous().numpy().tobytes(), digest_size=16).hexdigest()
 
 
 def make_header(teacher: str, revision: str, size: tuple[int, int], settings: dict) -> dict:
@@ -302,6 +314,10 @@ class ProxyStore:
             for label, values in zip(labels, tensor if name in columns else [tensor], strict=False):
                 if not values.isfinite().all():
                     raise ValueError(f"NaN or infinite values in {what} {path} ({label}); {again}")
+        for name, stated in header.get("values", {}).items():  # files of 0.1.0 have none
+            stated = stated[part] if name in columns else stated
+            if name in tensors and stated != [_digest(values) for values in _entries(tensors[name])]:
+                raise ValueError(f"damaged {what} {path} (values of {name} have changed since it was made); {again}")
         if changed := difference(header, {**self.expected, **digests}, names):
             raise ValueError(f"stale {what} {path}: {changed}; {again}")
         return tensors

@@ -7,10 +7,10 @@ It is asked once: the image processor, the size at the network, what is predicte
 """
 
 import inspect
-import pickle
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -294,7 +294,7 @@ def _forward(network: Any, pixel_values: torch.Tensor) -> Any:
     if training:
         network.eval()
     try:
-        with torch.no_grad(), torch.autocast(device.type, enabled=False):
+        with torch.no_grad(), torch.autocast(device.type, enabled=False), _without_tf32():
             return network(pixel_values=pixel_values.to(device)) if is_module else network(pixel_values)
     except RuntimeError as error:
         # Some architectures take squares only, or more than the patch size asks for; they say it in terms of tensors.
@@ -308,6 +308,21 @@ def _forward(network: Any, pixel_values: torch.Tensor) -> Any:
     finally:
         for module in training:
             module.training = True
+
+
+@contextmanager
+def _without_tf32() -> Iterator[None]:
+    """Inside, float32 has all of its 23 bits on CUDA too; cuDNN's convolutions would else round to 10."""
+    cudnn: Any = torch.backends.cudnn
+    parts: list[Any] = [cudnn.conv, cudnn.rnn, torch.backends.cuda.matmul]
+    before = [part.fp32_precision for part in parts]
+    try:
+        for part in parts:
+            part.fp32_precision = "ieee"
+        yield
+    finally:
+        for part, precision in zip(parts, before, strict=True):
+            part.fp32_precision = precision
 
 
 def _recipe(network: Any) -> Any:
@@ -341,14 +356,12 @@ def load_base(base: str | Path, revision: str | None = None, with_processor: boo
     check_base_name(base)
     options = {"revision": revision, "trust_remote_code": False}  # no question on the terminal, no foreign code
     try:
-        model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, **options)
+        model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, use_safetensors=True, **options)
         processor = load_processor(base, revision) if with_processor else None
     except OSError as error:
+        if "safetensors" in str(error) and Path(base).is_dir() and any(Path(base).glob("*.bin")):
+            raise ValueError(f"base model {base}: it has pickled weights only (.bin); take safetensors") from None
         raise FileNotFoundError(f"base model {base}: {reason(error)}") from error
-    except pickle.UnpicklingError:
-        raise ValueError(
-            f"base model {base}: its weights are a pickle that would run code; take safetensors"
-        ) from None
     except (ValueError, RuntimeError, SafetensorError) as error:  # of another shape, cut off, no tensors
         raise ValueError(f"base model {base}: {reason(error)}") from error
     if getattr(model, "peft_config", None):  # transformers loads the base of an adapter by itself

@@ -82,7 +82,6 @@ RANGES = (
     (
         (
             "lora_rank",
-            "micro_batch_size",
             "per_device_train_batch_size",
             "gradient_accumulation_steps",
             "num_train_epochs",
@@ -111,6 +110,7 @@ RANGES = (
     (("adam_beta1", "adam_beta2"), lambda value: 0 <= value < 1, "must be at least 0 and below 1"),
     (("seed",), lambda value: value < 2**32, "must be below 2**32"),
     (("max_steps",), lambda value: value >= 1 or value == -1, "must be at least 1, or -1"),
+    (("micro_batch_size",), lambda value: value == "auto" or value >= 1, "must be at least 1, or auto"),
     (("retain",), lambda value: value == "auto" or value >= 0, "must not be negative"),
 )
 
@@ -156,7 +156,9 @@ class GiftTrainingArguments:
         None,
     )
     lambda_d: float = _arg("weight of the self-distillation, Eq. 6; 0 collapses the depth", 1.0)
-    micro_batch_size: int = _arg("images per forward; bounds the memory, not the gradient", 2)
+    micro_batch_size: str = _arg(
+        "images per forward: a number, or auto, what memory allows, chosen when the run starts (the paper: 2)", "auto"
+    )
     retain: str = _arg("images whose graphs are kept instead of replayed: 0 (the paper), a number, or auto", "auto")
     per_device_train_batch_size: int = _arg("surface: images per forward, of any groups", 4)
     gradient_accumulation_steps: int = _arg("surface: forwards per update and process", 1)
@@ -173,7 +175,9 @@ class GiftTrainingArguments:
         "recompute the blocks in the backward; smaller graphs, more are retained", False
     )
     compile: bool = _arg("torch.compile the encoder's blocks; changes the bits", False)
-    channels_last: bool = _arg("the head's convolutions in channels-last layout; changes the bits", False)
+    channels_last: bool | None = _arg(
+        "the head's convolutions in channels-last layout; changes the bits; default: on CUDA, with head: full", None
+    )
     num_train_epochs: int = _arg("passes over the groups (one update per group) or, for surface, their images", 50)
     max_steps: int = _arg("stop after this many updates; -1: num_train_epochs decides", -1)
     learning_rate: float = _arg("Adam's learning rate at the first update", 2e-5)
@@ -185,7 +189,9 @@ class GiftTrainingArguments:
     adam_epsilon: float = _arg("Adam's epsilon", 1e-8)
     weight_decay: float = _arg("Adam's weight decay", 0.0)
     mixed_precision: Literal["no", "bf16", "fp16"] | None = _arg(
-        "autocast; default: accelerate's setting, else bf16 on CUDA and no on CPU; fp16 is refused", None
+        "autocast; default: accelerate's setting, else bf16 on CUDA (compute capability 8.0 and newer) and no "
+        "elsewhere; fp16 is refused",
+        None,
     )
     seed: int = _arg("seed of the LoRA initialisation and of the order of the groups", 0)
     dataloader_num_workers: int = _arg("threads that decode and resize the next groups", 2)
@@ -224,11 +230,12 @@ class GiftTrainingArguments:
                 setattr(self, name, expand_home(str(value)))
         if self.mixed_precision == "fp16":
             raise ValueError("mixed_precision: fp16 would need a loss scaler around the group step; use bf16 or no")
-        if str(self.retain) != "auto":
-            try:
-                self.retain = int(self.retain)
-            except ValueError:
-                raise ValueError(f"retain: expected auto or a number of images, got {self.retain!r}") from None
+        for name in ("micro_batch_size", "retain"):
+            if str(value := getattr(self, name)) != "auto":
+                try:
+                    setattr(self, name, int(value))
+                except ValueError:
+                    raise ValueError(f"{name}: expected auto or a number of images, got {value!r}") from None
         if self.size is not None:
             parse_size(self.size)
         for names, holds, text in RANGES:

@@ -111,13 +111,20 @@ def write_checkpoint(
     with disk_errors(target), whole_folder(target, CHECKPOINT_FILES) as folder:
         save(folder)
         save_file(optimizer_tensors(model, optimizer), folder / OPTIMIZER)
-        save_file(_rng_tensors(), folder / RNG)
+        save_file(_rng_tensors(next(model.parameters()).device), folder / RNG)
         content = json.dumps({"identity": identity, **asdict(state)}, indent=1, allow_nan=False)
         (folder / STATE).write_text(content + "\n", encoding="utf-8")
         if state.best_step:
             shutil.copytree(output_dir / "adapter", folder / BEST, copy_function=_link_weights)
         sums = {f.relative_to(folder).as_posix(): _digest(f) for f in _files(folder)}
         (folder / CHECKSUMS).write_text(json.dumps(sums, indent=1) + "\n", encoding="utf-8")
+
+
+def saved_identity(checkpoint: Path) -> dict:
+    """The `run_identity` of the run that wrote a checkpoint; empty where `restore` will refuse it."""
+    saved = json.loads((checkpoint / STATE).read_text(encoding="utf-8"))
+    identity = saved.get("identity") if isinstance(saved, dict) else None
+    return identity if isinstance(identity, dict) else {}
 
 
 def restore(
@@ -153,8 +160,8 @@ def restore(
     load_optimizer_tensors(model, optimizer, load_file(checkpoint / OPTIMIZER))
     rng = load_file(checkpoint / RNG)
     torch.set_rng_state(rng["cpu"])
-    if "cuda" in rng and torch.cuda.is_available():
-        torch.cuda.set_rng_state(rng["cuda"])
+    if "cuda" in rng and accelerator.device.type == "cuda":
+        torch.cuda.set_rng_state(rng["cuda"], accelerator.device)
     if accelerator.is_main_process:
         write_metrics(output_dir, state.rows)
         best = output_dir / "adapter"
@@ -324,10 +331,10 @@ def load_optimizer_tensors(model, optimizer, tensors: dict[str, torch.Tensor]) -
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
-def _rng_tensors() -> dict[str, torch.Tensor]:
+def _rng_tensors(device: torch.device) -> dict[str, torch.Tensor]:
     tensors = {"cpu": torch.get_rng_state()}
-    if torch.cuda.is_available():
-        tensors["cuda"] = torch.cuda.get_rng_state()
+    if device.type == "cuda":
+        tensors["cuda"] = torch.cuda.get_rng_state(device)
     return tensors
 
 

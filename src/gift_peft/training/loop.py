@@ -7,7 +7,7 @@ on) -> finish: the adapter with the smallest validation GCE. With `target: surfa
 
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from gift_peft.dataset.cache import default_cache_dir
 from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.loader import PreparedGroups
 from gift_peft.dataset.proxies import proxies_command
-from gift_peft.dataset.tensors import Group
+from gift_peft.memory import is_out_of_memory
 from gift_peft.models.identity import weights_revision
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.models.pixels import resolve_size
@@ -32,11 +32,12 @@ from gift_peft.rules import check_pair
 from gift_peft.training import checkpoints, upload, validation
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.checkpoints import State, write_metrics
-from gift_peft.training.objectives import OBJECTIVES, Consensus, Losses, Share, Surface
+from gift_peft.training.objectives import OBJECTIVES, Consensus, Loaded, Losses, Share, Surface
+from gift_peft.training.precision import exact_output
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress, how_to_resume, summary
 from gift_peft.training.schedule import Schedule
-from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, use_channels_last
+from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, tuned_for, use_channels_last
 from gift_peft.training.start import (
     Interrupted,
     agree,
@@ -97,6 +98,7 @@ def train(
 def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command: str | None) -> TrainResult:
     # check: what can be known to fail fails before a model is loaded
     output, checkpoint = check_run(args, accelerator)
+    args = replace(args, channels_last=tuned_for(accelerator.device, args.channels_last, args.head))
 
     # load: float32 weights whatever the checkpoint's, bf16 is autocast's business (paper, implementation details)
     base, processor = load_base(args.model_name_or_path, args.model_revision)
@@ -104,17 +106,21 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command
     size = resolve_size(args.size, recipe, processor, base.config)
 
     # data
-    groups = _groups(args, processor, size, accelerator)
+    teacher = DepthModel(base.to(accelerator.device), processor, size, kind)
+    groups = _groups(args, teacher, accelerator)
     train_groups, validation_groups = groups["train"], groups.get("validation")
     identity = checkpoints.run_identity(args, [part.dataset for part in groups.values()], size, accelerator)
 
     # objective
     network, optimizer = adapt(args, base, recipe, accelerator)
     objective = OBJECTIVES[args.target](args, train_groups, network, optimizer, accelerator)
+    settled = objective.settle(checkpoints.saved_identity(checkpoint) if checkpoint else {})
+    args, identity = replace(args, **settled), identity | {k: v for k, v in settled.items() if k in identity}
     optimizer, schedule = objective.optimizer, Schedule(args, objective.epoch_steps)
     if args.profile:
         with closing(objective.feed(0)) as feed:
-            accelerator.print(profile_updates(args.profile, objective.step, optimizer, train_groups, feed))
+            inputs = (group.inputs for group in feed)
+            accelerator.print(profile_updates(args.profile, objective.step, optimizer, train_groups, inputs))
         return TrainResult(output, 0, [], None)
 
     # fit
@@ -130,6 +136,8 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command
         f"{len(train_groups)} train and {len(validation_groups or ())} validation groups at {size[0]}x{size[1]}, "
         f"{schedule.total_steps} updates of {trained / 1e6:.2f} M weights, autocast {accelerator.mixed_precision}"
     )
+    if settled:
+        accelerator.print(f"Micro-batches of {args.micro_batch_size} images, by memory (micro_batch_size: auto)")
     if validation_groups is None:
         accelerator.print("No validation split: adapter/ will be the last adapter, not the best of several.")
     if checkpoint:
@@ -181,10 +189,9 @@ def find_recipe(args: GiftTrainingArguments, base: torch.nn.Module) -> tuple[Gif
         raise ValueError(f"model_name_or_path: {error} (as arguments: {names})") from None
 
 
-def _groups(
-    args: GiftTrainingArguments, processor: Any, size: tuple[int, int], accelerator: Accelerator
-) -> dict[str, PreparedGroups]:
-    """`train` and, where there is one, `validation`, with their proxies, which are made if missing."""
+def _groups(args: GiftTrainingArguments, teacher: DepthModel, accelerator: Accelerator) -> dict[str, PreparedGroups]:
+    """`train` and, where there is one, `validation`, with their proxies, which `teacher` makes if missing."""
+    size = teacher.size
     splits = gift_i_splits(args.dataset_name)
     if "train" not in splits:
         raise ValueError(f"dataset_name: {args.dataset_name} has no train split")
@@ -192,6 +199,7 @@ def _groups(
     surface = args.surface_settings() if args.target == "surface" else None
     try:
         make = partial(make_proxies, args.model_name_or_path, args.dataset_name, accelerator=accelerator, **places)
+        make = partial(make, model=teacher)
         if surface is None:
             make(splits)
         else:  # with the surface targets of a split its proxies are made too
@@ -216,7 +224,8 @@ def _groups(
                 accelerator.print(
                     "\n".join(["Surface targets of the training groups", *(f"  {line}" for line in told)])
                 )
-            groups[split] = PreparedGroups(rows, processor, size, args.dataloader_num_workers, cache_dir)
+            options = (args.dataloader_num_workers, cache_dir, accelerator.device.type == "cuda")
+            groups[split] = PreparedGroups(rows, teacher.processor, size, *options)
     return groups
 
 
@@ -227,6 +236,7 @@ def adapt(
     set_seed(args.seed)  # the same on every process, so that the adapters start equal
     model = get_gift_model(base, rank=args.lora_rank, head=args.head, recipe=recipe)
     model = model.to(accelerator.device).eval()  # eval mode: a replay must repeat its snapshot
+    exact_output(model)
     if args.gradient_checkpointing:
         checkpoint_blocks(model)
     if args.channels_last:
@@ -262,13 +272,13 @@ def _fit(
     ):
         while not (signum := agree(stop.signum, accelerator)):
             if schedule.row_is_due(state):
+                if state.step == 0 and not state.num_groups:  # before a validation: masks that cannot teach are told
+                    for losses in objective.first_look(not is_main):
+                        state.add(*losses)
                 try:
                     measured = measure(schedule.validation_is_due(state.step), lambda: stop.signum)
                 except Interrupted:  # a resumed run begins with this row
                     continue
-                if state.step == 0:
-                    for losses in objective.first_look(not is_main):
-                        state.add(*losses)
                 metric = f"val_{schedule.args.metric_for_best_model}"
                 is_best = state.close_epoch(schedule.epoch_steps, measured, metric)
                 if is_main:
@@ -286,7 +296,9 @@ def _fit(
             item = next(feed)
             try:
                 losses = _update(objective, item, accelerator, schedule.args.max_grad_norm)
-            except (ValueError, torch.OutOfMemoryError) as error:
+            except (ValueError, RuntimeError) as error:
+                if not isinstance(error, ValueError) and not is_out_of_memory(error):
+                    raise
                 last = checkpoints.last_complete(output)
                 raise ValueError(f"step {state.step + 1}, {objective.named(item)}: {error}; {last}") from error
             state.step += 1
@@ -296,7 +308,7 @@ def _fit(
             if schedule.checkpoint_is_due(state.step) and not schedule.row_is_due(state):
                 save_checkpoint()
             progress.step(losses.total, losses.consistency)
-            if state.step == first and (note := objective.memory_note()):
+            if state.step == first and (note := objective.first_note(fresh=first == 1)):
                 progress.say(note)
         if signum:
             save_checkpoint()
@@ -304,7 +316,7 @@ def _fit(
 
 
 def _update(
-    objective: Consensus | Surface, item: Group | Share, accelerator: Accelerator, max_grad_norm: float
+    objective: Consensus | Surface, item: Loaded | Share, accelerator: Accelerator, max_grad_norm: float
 ) -> Losses:
     """One Adam step on what an update takes."""
     optimizer = objective.optimizer
@@ -332,6 +344,7 @@ def _save_adapter(
     """The adapter as it is now, with the last row as its metrics."""
     record = upload.run_record(
         args,
+        next(model.parameters()).device,
         step=state.step,
         epoch=state.step / epoch_steps,
         **about,

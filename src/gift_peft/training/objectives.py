@@ -1,25 +1,29 @@
 """What an update takes and does: a group pulled to what it agrees on (the paper), or images pulled to their targets.
 
-Both offer the loop the same: `optimizer`, `epoch_steps`, `feed(step)` with what each update takes, `accumulate` of
-that, which puts a gradient into `.grad`, and `first_look`, the base's own losses.
+Both offer the loop the same: `settle`, what "auto" comes to; `optimizer`, `epoch_steps`, `feed(step)` with what each
+update takes, `accumulate` of that, which puts a gradient into `.grad`, and `first_look`, the base's own losses.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from itertools import repeat
 from typing import Any, NamedTuple
 
 import torch
 from accelerate import Accelerator
+from accelerate.utils import gather_object
 from tqdm import tqdm
 
-from gift_peft.dataset.loader import PreparedGroups, PreparedImages, epoch_flips, epoch_order
+from gift_peft.dataset.loader import PreparedGroups, PreparedImages, epoch_flips, epoch_order, read_ahead
 from gift_peft.dataset.tensors import Group
+from gift_peft.group_inputs import GroupInputs
 from gift_peft.group_step import GroupStep
-from gift_peft.losses import GeometryConsistencyError, masked_l1
+from gift_peft.losses import gift_terms, masked_l1
 from gift_peft.training.arguments import GiftTrainingArguments
+from gift_peft.training.mask_checks import check_surroundings, warn_of_masks
 from gift_peft.training.schedule import updates_after
+from gift_peft.training.speed import checkpoint_blocks
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
 
@@ -31,6 +35,13 @@ class Losses(NamedTuple):
     distillation: float
     num_pairs: int
     count: int = 1
+
+
+class Loaded(NamedTuple):
+    """A group as an update takes it."""
+
+    group_id: str
+    inputs: GroupInputs
 
 
 class Consensus:
@@ -50,37 +61,84 @@ class Consensus:
         optimizer: torch.optim.Optimizer,
         accelerator: Accelerator,
     ) -> None:
-        self.groups, self.optimizer, self.seed = groups, optimizer, args.seed
+        self.args, self.groups, self.optimizer, self.accelerator = args, groups, optimizer, accelerator
         self.step = GroupStep(model, args.lambda_c, args.lambda_d, args.micro_batch_size, args.retain, accelerator)
         self.epoch_steps = len(groups)
 
-    def feed(self, step: int) -> Iterator[Group]:
-        """The groups of all updates after `step`, without end."""
-        order = updates_after(step, len(self.groups), lambda epoch: epoch_order(len(self.groups), self.seed, epoch))
-        return self.groups.take(order)
+    def settle(self, before: dict) -> dict[str, Any]:
+        """Arguments of this run that "auto" left open, chosen by memory; `before` the identity that it goes on with.
 
-    def accumulate(self, group: Group) -> Losses:
-        output = self.step.accumulate(group.pixel_values, group.mask, group.target, group.valid, group.names)
+        A model of which not even one image fits has its blocks recomputed in the backward, which gives the same bits.
+        Raises torch.OutOfMemoryError, on all processes, where that does not help.
+        """
+        if self.args.micro_batch_size != "auto":
+            return {}
+        settled: dict[str, Any] = {"micro_batch_size": before.get("micro_batch_size")}
+        if not before:
+            group = self._read(0).inputs
+            largest = max(map(len, self.groups.dataset["image_names"]))
+            try:
+                settled["micro_batch_size"] = self.step.choose_micro_batch_size(group, largest)
+            except torch.OutOfMemoryError:
+                if self.args.gradient_checkpointing:
+                    raise
+                self.accelerator.print(
+                    "The graph of one image does not fit into memory: its blocks are recomputed in the backward "
+                    "(gradient_checkpointing)"
+                )
+                checkpoint_blocks(self.step.model)
+                settled["gradient_checkpointing"] = True
+                settled["micro_batch_size"] = self.step.choose_micro_batch_size(group, largest)
+        self.step.micro_batch_size = settled["micro_batch_size"]
+        return settled
+
+    def feed(self, step: int) -> Iterator[Loaded]:
+        """The groups of all updates after `step`, without end."""
+        count, seed = len(self.groups), self.args.seed
+        order = updates_after(step, count, lambda epoch: epoch_order(count, seed, epoch))
+        return read_ahead(self._read, order, self.groups.num_threads)
+
+    def _read(self, index: int) -> Loaded:
+        """A group, checked and with its pairs found, in a thread that loads it."""
+        group = self.groups[index]
+        inputs = GroupInputs(group.pixel_values, group.mask, group.target, group.valid, group.names)
+        return Loaded(group.group_id, inputs.pin_memory() if self.groups.pin else inputs)
+
+    def accumulate(self, group: Loaded) -> Losses:
+        output = self.step.accumulate(*group.inputs.arguments())
         return Losses(float(output.total), float(output.consistency), float(output.distillation), output.num_pairs)
 
-    def named(self, group: Group) -> str:
+    def named(self, group: Loaded) -> str:
         """What an update takes, for messages."""
         return f"group {group.group_id}"
 
-    def first_look(self, quiet: bool) -> Iterator[Losses]:
-        """The base's on each group of an epoch.
+    def first_look(self, quiet: bool) -> list[Losses]:
+        """The base's on each group of an epoch; ValueError for masks that leave nothing to distill from.
 
         That needs no forward: the base's predictions are the proxies, its distillation is 0.
         """
-        for group in first_groups(self.groups, quiet):
-            error = GeometryConsistencyError()
-            consistency = error.update(group.target, group.mask, group.valid)
-            consistency = consistency if error.num_groups else 0.0
-            yield Losses(self.step.lambda_c * consistency, consistency, 0.0, error.num_groups)
 
-    def memory_note(self) -> str:
-        """What the first update has taught about memory; empty where nothing."""
-        return "" if self.step.budget is None else str(self.step.budget)
+        def look(group: Loaded) -> list[Losses]:
+            inputs = group.inputs
+            check_surroundings(group.group_id, inputs.mask, inputs.valid)
+            warn_of_masks(group.group_id, inputs)
+            tensors = (inputs.target, inputs.target, inputs.mask, inputs.pairs)
+            with torch.no_grad():
+                loss = gift_terms(*tensors, self.args.lambda_c, self.args.lambda_d, inputs.valid)
+            return [Losses(float(loss.total), float(loss.consistency), 0.0, loss.num_pairs)]
+
+        return look_at_all(self.groups, self._read, look, self.accelerator, quiet)
+
+    def first_note(self, fresh: bool) -> str:
+        """What the first update has taught: of memory and, in a `fresh` run, of rounding; empty where nothing."""
+        notes = [] if self.step.budget is None else [str(self.step.budget)]
+        share = float(self.step.first_share or 0)
+        if fresh and share > 0:
+            notes.append(
+                f"Rounding ({self.step.mixed_precision}) is {share:.0%} of the first update's pull, as distillation "
+                "from proxies in float32; it shrinks once the predictions have moved"
+            )
+        return "\n".join(notes)
 
 
 class Share(NamedTuple):
@@ -114,6 +172,10 @@ class Surface:
         self.step = SurfaceStep(prepared, *options)
         self.batch = args.per_device_train_batch_size * args.gradient_accumulation_steps * accelerator.num_processes
         self.epoch_steps = math.ceil(len(self.images) / self.batch)
+
+    def settle(self, before: dict) -> dict[str, Any]:
+        """Nothing is left open."""
+        return {}
 
     def epoch_updates(self, epoch: int) -> list[list[tuple[int, bool]]]:
         """(image, whether it is flipped) of each update of an epoch, over all processes; the last may have fewer."""
@@ -152,22 +214,46 @@ class Surface:
         """What an update takes of this process, for messages."""
         return f"images {', '.join(name for image in share.images for name in image.names)}"
 
-    def first_look(self, quiet: bool) -> Iterator[Losses]:
-        """The base's on each image, from the proxies as in `Consensus`."""
-        for group in first_groups(self.groups, quiet):
+    def first_look(self, quiet: bool) -> list[Losses]:
+        """The base's on each image, from the proxies as in `Consensus`; a fixed target holds without surroundings."""
+
+        def look(group: Group) -> list[Losses]:
             regions = group.mask if group.valid is None else group.mask & group.valid
+            losses = []
             for proxy, target, region in zip(group.target, group.surface_target, regions, strict=True):
                 distance = float(masked_l1(proxy, target, region)) if region.any() else 0.0
-                yield Losses(self.step.lambda_c * distance, distance, 0.0, 0)
+                losses.append(Losses(self.step.lambda_c * distance, distance, 0.0, 0))
+            return losses
 
-    def memory_note(self) -> str:
+        return look_at_all(self.groups, self.groups.__getitem__, look, self.accelerator, quiet)
+
+    def first_note(self, fresh: bool) -> str:
         """Nothing: what does not fit is halved when it turns out."""
         return ""
 
 
-def first_groups(groups: PreparedGroups, quiet: bool) -> Iterator[Group]:
-    """Every group once, with a bar that says so."""
-    return tqdm(groups.take(range(len(groups))), "first look", len(groups), unit="group", delay=2, disable=quiet)
+def look_at_all(
+    groups: PreparedGroups,
+    read: Callable[[int], Any],
+    look: Callable[[Any], list[Losses]],
+    accelerator: Accelerator,
+    quiet: bool,
+) -> list[Losses]:
+    """`look` of every group once, in their order, shared by the processes; the first ValueError is raised in all."""
+    mine = range(accelerator.process_index, len(groups), accelerator.num_processes)
+    bar = {"total": len(mine), "desc": "first look", "unit": "group", "delay": 2, "disable": quiet}
+    found, problem = [], None
+    try:
+        for index, item in zip(mine, tqdm(read_ahead(read, mine, groups.num_threads), **bar), strict=True):
+            found.append((index, look(item)))
+    except (ValueError, OSError) as error:
+        problem = error
+    if accelerator.num_processes > 1:
+        problem = next((each for each in gather_object([problem]) if each is not None), None)
+        found = sorted(gather_object(found), key=lambda pair: pair[0])
+    if problem is not None:
+        raise problem
+    return [losses for _, several in found for losses in several]
 
 
 OBJECTIVES = {"consensus": Consensus, "surface": Surface}

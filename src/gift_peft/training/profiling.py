@@ -18,7 +18,7 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from gift_peft.dataset.loader import PreparedGroups
-from gift_peft.dataset.tensors import Group
+from gift_peft.group_inputs import GroupInputs
 from gift_peft.group_step import GroupStep, GroupStepOutput
 
 PHASES = ("load", "snapshot", "loss", "replay", "reduce", "optimizer")
@@ -48,13 +48,13 @@ class Flops(NamedTuple):
 
 
 def timed_update(
-    step: GroupStep, optimizer: torch.optim.Optimizer, load: Callable[[], Group], phases: Phases
+    step: GroupStep, optimizer: torch.optim.Optimizer, load: Callable[[], GroupInputs], phases: Phases
 ) -> GroupStepOutput:
     """One update, from asking for the group to the changed weights."""
     with phases("load"):
         group = load()
     step.phase = phases
-    output = step.accumulate(group.pixel_values, group.mask, group.target, group.valid, group.names)
+    output = step.accumulate(*group.arguments())
     with phases("optimizer"):
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
@@ -62,16 +62,19 @@ def timed_update(
 
 
 def count_flops(model: nn.Module, pixel_values: torch.Tensor) -> Flops:
-    """Of a micro-batch (B,3,h,w): matrix products, convolutions and attention. Leaves gradients as they were."""
-    gradients = [(p, p.grad) for p in model.parameters()]
-    for p, _ in gradients:
-        p.grad = None
+    """Of a micro-batch (B,3,h,w): matrix products, convolutions and attention.
+
+    Counted on tensors without content: nothing is computed, no memory is taken, and `.grad` stays as it was.
+    """
+    stored = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+    meta = {name: torch.empty_like(tensor, device="meta") for name, tensor in stored.items()}
+    for name, tensor in meta.items():
+        tensor.requires_grad_(stored[name].requires_grad)
+    pixels = torch.empty_like(pixel_values, device="meta")
     with torch.enable_grad(), FlopCounterMode(display=False) as forward:
-        output = model(pixel_values=pixel_values.to(next(model.parameters()).device))
+        output = torch.func.functional_call(model, meta, kwargs={"pixel_values": pixels})
     with FlopCounterMode(display=False) as backward:
         getattr(output, "predicted_depth", output).sum().backward()
-    for p, gradient in gradients:
-        p.grad = gradient
     return Flops(*(counter.get_total_flops() / len(pixel_values) for counter in (forward, backward)))
 
 
@@ -119,7 +122,11 @@ def peak_memory(device: torch.device) -> int:
 
 
 def profile_updates(
-    num_updates: int, step: GroupStep, optimizer: torch.optim.Optimizer, groups: PreparedGroups, feed: Iterator[Group]
+    num_updates: int,
+    step: GroupStep,
+    optimizer: torch.optim.Optimizer,
+    groups: PreparedGroups,
+    feed: Iterator[GroupInputs],
 ) -> str:
     """Time `num_updates` updates on what `feed` gives, after one to warm up, as a table; `groups` are an epoch's.
 
@@ -131,9 +138,9 @@ def profile_updates(
     phases = Phases(device)
     sizes = []
 
-    def load() -> Group:
+    def load() -> GroupInputs:
         group = next(feed)
-        sizes.append(len(group.names))
+        sizes.append(len(group))
         return group
 
     started = time.perf_counter()
@@ -141,7 +148,7 @@ def profile_updates(
     seconds = time.perf_counter() - started
     images = sum(sizes)
     peak = peak_memory(device)
-    flops = count_flops(step.model, groups[0].pixel_values[: step.micro_batch_size])
+    flops = count_flops(step.model, groups[0].pixel_values[:1])
     dtype = torch.bfloat16 if step.mixed_precision == "bf16" else torch.float32
     rate = (forwards * flops.forward + images * flops.backward) / seconds / processes
     epoch_images = sum(map(len, groups.dataset["image_names"]))

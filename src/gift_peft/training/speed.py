@@ -14,6 +14,7 @@ from torch import nn
 from torch.utils.checkpoint import checkpoint
 from transformers.modeling_layers import GradientCheckpointingLayer
 
+VARIANTS = 32  # of one block's forward that torch.compile may keep; past its limit it would fail
 FUSED_DEVICES = ("cpu", "cuda", "mps", "xpu")  # where PyTorch's Adam has one kernel for all weights
 
 
@@ -40,9 +41,36 @@ def encoder_blocks(model: PeftModel) -> list[GradientCheckpointingLayer]:
 
 
 def compile_blocks(model: PeftModel) -> None:
-    """`torch.compile` each encoder block, in place; equal blocks share what is compiled. Names do not change."""
+    """`torch.compile` the forward of each encoder block as one graph, in place; names do not change.
+
+    Equal blocks share what is compiled, once for each kind of use: with and without gradient, autocast and float32, a
+    batch of one and of any other number.
+    """
+    torch._dynamo.config.recompile_limit = max(VARIANTS, torch._dynamo.config.recompile_limit)
     for block in encoder_blocks(model):
-        block.compile()
+        block.forward = torch.compile(block.forward, fullgraph=True)
+        block.register_forward_pre_hook(_DynamicBatch())
+
+
+class _DynamicBatch:
+    """Before a compiled block: its batch may have any size; and, once, what would break its graph is taken out.
+
+    That is transformers' hook for `output_attentions`, which nobody reads here. It comes with the first forward.
+    """
+
+    def __init__(self) -> None:
+        self.done = False
+
+    def __call__(self, block: nn.Module, args: tuple) -> None:
+        if not self.done:
+            self.done = True
+            for part in block.modules():
+                for number, hook in list(part._forward_hooks.items()):
+                    if part is not block and getattr(hook, "__name__", "") == "output_capturing_hook":
+                        del part._forward_hooks[number]
+        for value in args:
+            if isinstance(value, torch.Tensor) and value.ndim:
+                torch._dynamo.maybe_mark_dynamic(value, 0)
 
 
 def checkpoint_blocks(model: PeftModel) -> None:
@@ -55,6 +83,16 @@ def checkpoint_blocks(model: PeftModel) -> None:
         block.gradient_checkpointing = True
         block._gradient_checkpointing_func = partial(checkpoint, use_reentrant=False)
         block.training = True
+
+
+def tuned_for(device: torch.device, channels_last: bool | None, head: str) -> bool:
+    """Whether the head's convolutions run in channels-last layout: as asked, else on CUDA, where bf16 ones want it.
+
+    On CUDA cuDNN also tries its algorithms out from now on; a run has images of one or two sizes.
+    """
+    if device.type == "cuda":
+        torch.backends.cudnn.benchmark = True
+    return device.type == "cuda" and head == "full" if channels_last is None else channels_last
 
 
 def use_channels_last(model: PeftModel) -> None:

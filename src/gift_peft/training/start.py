@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from datetime import timedelta
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,19 +27,20 @@ from gift_peft.evaluation.booster_scenes import find_booster
 from gift_peft.files import reason
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.checkpoints import find_checkpoint, last_complete, remove_leftovers
+from gift_peft.training.precision import choose_precision
 from gift_peft.training.run_folder import check_folder, delete_run, holds_run, write_config
 from gift_peft.training.upload import check_push
 
 # How launchers tell a process how many there are: torchrun, Open MPI, MPICH and Intel MPI, MVAPICH, srun.
 WORLD_SIZES = ("WORLD_SIZE", "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
+LONGEST_WAIT = timedelta(hours=12)  # of one process for another; one that dies is noticed by torchrun, or at once
 
 
 def make_accelerator(args: GiftTrainingArguments) -> Accelerator:
-    """Device, processes, mixed precision (the argument, else accelerate's setting, else bf16 on CUDA) and tracker."""
-    on_cuda = PartialState(cpu=parse_flag_from_env("ACCELERATE_USE_CPU")).device.type == "cuda"
-    precision = args.mixed_precision or os.environ.get("ACCELERATE_MIXED_PRECISION") or ("bf16" if on_cuda else "no")
-    if precision not in ("no", "bf16"):
-        raise ValueError(f"mixed_precision: {precision} (accelerate's setting) is not supported; use bf16 or no")
+    """Device, processes, mixed precision (`choose_precision`) and tracker."""
+    # Before the first update one process may work for long while the others wait: digests and proxies of a large set.
+    state = PartialState(cpu=parse_flag_from_env("ACCELERATE_USE_CPU"), timeout=LONGEST_WAIT)
+    precision = choose_precision(args.mixed_precision, state.device, state.print)
     if args.report_to != "none" and find_spec(args.report_to) is None:
         raise ValueError(f"report_to: {args.report_to} is not installed; pip install gift-peft[{args.report_to}]")
     tell_missing_processes(PartialState().num_processes)
@@ -188,7 +190,7 @@ def agree(signum: int, accelerator: Accelerator) -> int:
     """The signal to stop by, if any process has received one, on all of them."""
     if accelerator.num_processes == 1:
         return signum
-    received = accelerator.gather(torch.tensor([signum], device=accelerator.device))
+    received = accelerator.gather(torch.full((1,), signum, device=accelerator.device))
     return int(received.max())
 
 

@@ -17,7 +17,9 @@ import torch
 from accelerate.utils import gather_object
 from torch import Tensor, nn
 
+from gift_peft.group_inputs import check_lambdas
 from gift_peft.losses import masked_l1, require_finite, self_distillation_loss
+from gift_peft.memory import is_out_of_memory, release_memory
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -71,6 +73,7 @@ class SurfaceStep:
         micro_batch_size: int = 4,
         accelerator: Accelerator | None = None,
     ) -> None:
+        check_lambdas(lambda_c=lambda_c, lambda_d=lambda_d)
         self.model = model
         self.lambda_c = lambda_c
         self.lambda_d = lambda_d
@@ -100,14 +103,13 @@ class SurfaceStep:
         while True:
             try:
                 return self._accumulate(pixel_values, mask, target, valid, names, weight)
-            except torch.OutOfMemoryError:
-                if self.micro_batch_size == 1 or self._world > 1:
+            except RuntimeError as error:
+                if self.micro_batch_size == 1 or self._world > 1 or not is_out_of_memory(error):
                     raise
             # Outside of `except` the error is gone, and with it the frames whose tensors still took memory.
             self.micro_batch_size = max(1, min(self.micro_batch_size, len(mask)) // 2)
             logger.warning("out of memory: at most %d images per forward from now on", self.micro_batch_size)
-            if torch.cuda.is_available():
-                torch.cuda.empty_cache()
+            release_memory(next(self.model.parameters()).device)
 
     def _accumulate(
         self,
@@ -124,7 +126,8 @@ class SurfaceStep:
         for p in parameters:
             p.grad = None
         device = parameters[0].device
-        means = torch.zeros(3, dtype=torch.float64, device=device)  # the two terms, and whether something is wrong
+        # The two terms, and whether something is wrong; Apple's GPUs have no float64.
+        means = torch.zeros(3, dtype=torch.float32 if device.type == "mps" else torch.float64, device=device)
         problem, loss = None, torch.zeros(())
         for start in range(0, len(mask), self.micro_batch_size):
             batch, is_last = slice(start, start + self.micro_batch_size), start + self.micro_batch_size >= len(mask)
@@ -164,12 +167,13 @@ class SurfaceStep:
             raise ValueError(f"the prediction is {made} but mask and target are {sizes}: resize them to its size")
         require_finite(prediction.detach(), "the prediction", names)
         require_finite(target, "the surface target", names)
-        near = _without_rounding(prediction, target)
         regions = mask if valid is None else mask & valid
         terms = []
         for index, region in enumerate(regions):
             one = slice(index, index + 1)
-            other = self_distillation_loss(near[one], target[one], mask[one], None if valid is None else valid[one])
+            other = self_distillation_loss(
+                prediction[one], target[one], mask[one], None if valid is None else valid[one]
+            )
             inside = masked_l1(prediction[index], target[index], region) if region.any() else torch.zeros_like(other)
             terms.append(torch.stack([inside, other]))
         return torch.stack(terms).sum(0)
@@ -198,13 +202,3 @@ class SurfaceStep:
     def _without_exchange(self) -> AbstractContextManager:
         """DDP sums the gradients of an update once, with its last micro-batch."""
         return nullcontext() if self.accelerator is None else self.accelerator.no_sync(self.model)
-
-
-def _without_rounding(prediction: Tensor, target: Tensor) -> Tensor:
-    """The prediction (n,H,W), but the target itself where they differ by what another cut into batches changes.
-
-    The sign of such a difference is noise, and an adapter at its start would get a whole gradient of it outside of
-    the mask. Up to 2^-18 of the image's largest |target| count as none; in float64 2^-46.
-    """
-    limit = target.abs().amax((1, 2), keepdim=True) * 2.0 ** (-46 if prediction.dtype == torch.float64 else -18)
-    return torch.where((prediction - target).abs() <= limit, target.to(prediction.dtype), prediction)

@@ -1,8 +1,9 @@
 """The teacher: the frozen base model, asked once for every image before training starts (paper section 4, proxies).
 
-Proxies are float32 and made with the same cut into micro-batches as the group step, so at the first training step the
-self-distillation of a model whose adapter is still zero is exactly zero. Surface targets are computed from the
-proxies, and from what the teacher predicts for the flipped photos and for fills (surface_targets.py).
+Proxies are float32, without TF32. Where training is too, the self-distillation of a model whose adapter is still zero
+is exactly zero, however both are cut into batches: the losses take differences of rounding for none. Surface targets
+are computed from the proxies, and from what the teacher predicts for the flipped photos and for fills
+(surface_targets.py).
 """
 
 from collections.abc import Iterable, Sequence
@@ -60,6 +61,7 @@ def make_proxies(
     overwrite: bool = False,
     surface: SurfaceSettings | None = None,
     kind: str | None = None,
+    model: DepthModel | None = None,
 ) -> Path:
     """Predict every image and treated reference of a dataset and keep it for training and evaluation.
 
@@ -71,7 +73,7 @@ def make_proxies(
         dataset_path (`str` or `Path`): anything `load_gift_i` takes.
         splits (`Sequence[str]`, *optional*): default all that the dataset has.
         size (`tuple[int, int]` or `str`, *optional*): (h, w) or "HxW"; default the recipe's, else the processor's.
-        batch_size (`int`): images per forward; predictions equal training's to the bit if it has the same.
+        batch_size (`int`): images per forward; the same everywhere, so that equal proxies are equal files.
         proxies_dir (`str` or `Path`, *optional*): default the dataset's own `proxies` folder, or a cache folder for
             hub ids and folders that cannot be written (`default_proxies_dir`).
         accelerator (`Accelerator`, *optional*): its device and processes; default what `accelerate launch` set up.
@@ -79,6 +81,7 @@ def make_proxies(
             (proxies that hold are kept).
         surface (`SurfaceSettings`, *optional*): also make the surface targets, with these settings.
         kind (`str`, *optional*): what the teacher predicts, for surface targets; default what its recipe says.
+        model (`DepthModel`, *optional*): the teacher, where it is loaded already; its size and kind are its own.
 
     Returns:
         `Path`: `<proxies_dir>/<teacher>/<h>x<w>`; files that 0.1.0 made one folder higher stay there while they hold.
@@ -90,7 +93,7 @@ def make_proxies(
     state = accelerator or PartialState(cpu=parse_flag_from_env("ACCELERATE_USE_CPU"))
     identity = teacher_id(base, revision)
     pinned = teacher_revision(base, revision)
-    model = DepthModel.from_pretrained(base, revision=revision, size=size, kind=kind, device=state.device)
+    model = model or DepthModel.from_pretrained(base, revision=revision, size=size, kind=kind, device=state.device)
     folder = Path(proxies_dir or default_proxies_dir(dataset_path, identity)) / identity
     named = "x".join(map(str, model.size))
     place = (base, dataset_path, named, proxies_dir, revision)

@@ -16,19 +16,20 @@ from gift_peft.training.arguments import FREE_TO_CHANGE, GiftTrainingArguments
 # And all that a resumed run may not change.
 RECORDED = ("model_revision", "dataset_name", "num_train_epochs", "max_steps", "retain")
 RECORDED += ("per_device_train_batch_size", "gradient_accumulation_steps")
+CPU = torch.device("cpu")
 
 
-def run_record(args: GiftTrainingArguments, **about) -> dict:
-    """What was run, for gift.json: arguments, versions, kind of machine, and `about` (size, metrics, fingerprint)."""
+def run_record(args: GiftTrainingArguments, device: torch.device = CPU, **about) -> dict:
+    """What was run, for gift.json: arguments, versions, kind of device, and `about` (size, metrics, fingerprint)."""
     arguments = {k: v for k, v in args.values().items() if k in RECORDED or k not in FREE_TO_CHANGE}
     arguments = {k: v for k, v in arguments.items() if v is not None and v != []}
     for name in ("model_name_or_path", "dataset_name"):
         arguments[name] = portable_name(arguments[name])
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{platform.machine()} CPU"
+    machine = f"{platform.machine()} {device.type.upper()}"
     return {
         "arguments": arguments,
         "versions": versions(),
-        "device": device,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else machine,
         **about,
     }
 

@@ -9,8 +9,7 @@ It is asked once: the image processor, the size at the network, what is predicte
 import inspect
 import re
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +23,7 @@ from torch import nn
 from gift_peft.files import reason
 from gift_peft.images import given_picture
 from gift_peft.models.adapter_base import check_base, find_base
+from gift_peft.models.full_precision import without_tf32
 from gift_peft.models.identity import adapter_as_base, check_base_name
 from gift_peft.models.pixels import resolve_size, to_pixel_values
 from gift_peft.rules import KINDS, UNKNOWN
@@ -294,7 +294,7 @@ def _forward(network: Any, pixel_values: torch.Tensor) -> Any:
     if training:
         network.eval()
     try:
-        with torch.no_grad(), torch.autocast(device.type, enabled=False), _without_tf32():
+        with torch.no_grad(), torch.autocast(device.type, enabled=False), without_tf32():
             return network(pixel_values=pixel_values.to(device)) if is_module else network(pixel_values)
     except RuntimeError as error:
         # Some architectures take squares only, or more than the patch size asks for; they say it in terms of tensors.
@@ -308,21 +308,6 @@ def _forward(network: Any, pixel_values: torch.Tensor) -> Any:
     finally:
         for module in training:
             module.training = True
-
-
-@contextmanager
-def _without_tf32() -> Iterator[None]:
-    """Inside, float32 has all of its 23 bits on CUDA too; cuDNN's convolutions would else round to 10."""
-    cudnn: Any = torch.backends.cudnn
-    parts: list[Any] = [cudnn.conv, cudnn.rnn, torch.backends.cuda.matmul]
-    before = [part.fp32_precision for part in parts]
-    try:
-        for part in parts:
-            part.fp32_precision = "ieee"
-        yield
-    finally:
-        for part, precision in zip(parts, before, strict=True):
-            part.fp32_precision = precision
 
 
 def _recipe(network: Any) -> Any:

@@ -171,7 +171,17 @@ def is_leftover(name: str) -> bool:
     """Whether a file or folder of this name is passed over wherever a person's files are listed: hidden ones
     (`.DS_Store`, `._photo.jpg`, `.AppleDouble`), and those of `LEFTOVERS`.
     """
-    return name.startswith(".") or name.casefold() in LEFTOVERS
+    return (name.startswith(".") and not is_in_the_cloud(name)) or name.casefold() in LEFTOVERS
+
+
+def is_in_the_cloud(name: str) -> bool:
+    """Whether a file stands for one that is still in iCloud: `.photo.jpg.icloud` for photo.jpg."""
+    return name.startswith(".") and name.endswith(".icloud")
+
+
+def is_lfs_pointer(start: bytes) -> bool:
+    """Whether a file begins as what Git LFS keeps in place of a file that was not fetched."""
+    return start.startswith(b"version https://git-lfs")
 
 
 # ---- small files ----

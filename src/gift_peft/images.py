@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageOps
 
-from gift_peft.files import is_leftover, reason
+from gift_peft.files import is_in_the_cloud, is_leftover, is_lfs_pointer, reason
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +71,10 @@ def name_skipped(names: Sequence[str]) -> str:
     """How messages tell of files that are not read: their number, their names, and what helps."""
     heif = any(Path(name).suffix.lower() in HEIF_SUFFIXES for name in names)
     count = f"{len(names)} file{'s are' if len(names) != 1 else ' is'} not read"
-    return f"{count}: {', '.join(names)}" + (f" ({HEIF_HINT})" if heif else "")
+    hints = [HEIF_HINT] if heif else []
+    if any(is_in_the_cloud(Path(name).name) for name in names):
+        hints.append("download what is still in iCloud")
+    return f"{count}: {', '.join(names)}" + (f" ({'; '.join(hints)})" if hints else "")
 
 
 def open_image(source: str | Path | bytes | Image.Image, name: str | None = None) -> Image.Image:
@@ -82,6 +85,7 @@ def open_image(source: str | Path | bytes | Image.Image, name: str | None = None
     name = name or str(source)
     try:
         image = source if isinstance(source, Image.Image) else _opened(source)
+        pages = _pages(image)
         # Pillow reduces 16-bit RGB to 8 bits while decoding; only the tiles of a file not yet decoded tell.
         deep = any(";16" in str(tile[-1]) for tile in getattr(image, "tile", ()))
         image.load()
@@ -94,8 +98,15 @@ def open_image(source: str | Path | bytes | Image.Image, name: str | None = None
         why = "; the link leads nowhere: fetch its content (git annex get, dvc pull, hf download)" if dangling else ""
         raise FileNotFoundError(f"{name}: no such file{why}") from None
     except (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError) as error:
-        hint = f"; it is HEIC: {HEIF_HINT}" if _is_heif(source) and not reads_heif() else f" ({reason(error)})"
+        if _is_heif(source) and not reads_heif():
+            hint = f"; it is HEIC: {HEIF_HINT}"
+        elif is_lfs_pointer(_start(source)):
+            hint = "; only Git LFS's pointer to it is there: `git lfs pull` fetches the file"
+        else:
+            hint = f" ({reason(error)})"
         raise ValueError(f"{name}: not a readable image, or truncated{hint}") from None
+    if pages > 1:
+        raise ValueError(f"{name}: it holds {pages} pictures; save each as a file of its own")
     if deep and image.mode not in SINGLE_CHANNEL:
         raise ValueError(f"{name}: a 16-bit image; save it with 8 bits per channel")
     return image
@@ -112,18 +123,35 @@ def _opened(source: str | Path | bytes) -> Image.Image:
 
 def _is_heif(source: str | Path | bytes | Image.Image) -> bool:
     """By the content: phones also call such files .jpg."""
-    if isinstance(source, Image.Image):
-        return False
-    try:
-        start = source[:12] if isinstance(source, bytes) else _first_bytes(source)
-    except OSError:
-        return False
+    start = _start(source)
     return start[4:8] == b"ftyp" and start[8:12] in HEIF_BRANDS
 
 
-def _first_bytes(path: str | Path) -> bytes:
-    with open(path, "rb") as file:
-        return file.read(12)
+def _start(source: str | Path | bytes | Image.Image) -> bytes:
+    """The first bytes of a file, none of what is no file or cannot be read."""
+    if isinstance(source, Image.Image | bytes):
+        return source[:32] if isinstance(source, bytes) else b""
+    try:
+        with open(source, "rb") as file:
+            return file.read(32)
+    except OSError:
+        return b""
+
+
+def _pages(image: Image.Image) -> int:
+    """How many pictures of its size a file of a kind for several holds. MPO, AVIF and HEIC say which one is the photo;
+    TIFF also keeps small previews.
+    """
+    if image.format not in ("TIFF", "GIF", "PNG", "WEBP") or getattr(image, "n_frames", 1) == 1:
+        return 1
+    if image.format != "TIFF":
+        return image.n_frames
+    size, count = image.size, 0
+    for page in range(image.n_frames):
+        image.seek(page)
+        count += image.size == size
+    image.seek(0)
+    return count
 
 
 def hidden_turn(path: Path) -> int | None:

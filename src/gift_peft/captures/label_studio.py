@@ -50,10 +50,12 @@ class LabelStudioImage:
 def label_studio_images(content: list) -> dict[str, LabelStudioImage]:
     """What Label Studio's own JSON says of each image, by its name.
 
-    Raises ValueError for two annotations of one image, missing labels, and names with `..`.
+    Raises ValueError for two annotations of one image, missing labels, and a file of nothing but predictions.
     """
     images: dict[str, LabelStudioImage] = {}
     labels: dict[str, tuple] = {}
+    if any(task.get("predictions") for task in content) and not any(task.get("annotations") for task in content):
+        raise ValueError("it holds predictions only, which nobody has submitted as annotations in Label Studio")
     for task in content:
         name = _task_image(task)
         if name in images:

@@ -142,6 +142,16 @@ def remove_files(root: Path, names: Iterable[str]) -> None:
                 break  # it holds something else, or is gone
 
 
+def check_own_file(path: Path, mark: str, option: str) -> None:
+    """Raise ValueError if the file that an option names is there and is not ours: it does not hold `mark`, a line that
+    all of its kind have. IsADirectoryError for a folder.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f"{option} {path} is a folder: name a file in it")
+    if os.path.lexists(path) and not (path.is_file() and mark.encode() in path.read_bytes()):
+        raise ValueError(f"{option} {path} was not written by this command and is kept: name another file")
+
+
 def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     """Raise ValueError if a file to be written is one that is read: the same one, also through links, or one whose
     name differs in case or in the composition of accents alone, which is the same on many disks."""

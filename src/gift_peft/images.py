@@ -5,14 +5,17 @@ so in one line that names the file.
 """
 
 import base64
+import glob
 import hashlib
 import io
 import logging
+import os
 import re
 import struct
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -289,6 +292,13 @@ def sort_pictures(paths: Iterable[Path]) -> list[Path]:
     return sorted(filter(is_image_file, paths), key=lambda path: natural_key(path.name))
 
 
+def _matching(path: str | Path) -> list[Path]:
+    """The files of a pattern like `photos/*.jpg`, which shells of Windows leave to the program; else the path."""
+    if glob.has_magic(str(path)) and not os.path.lexists(path):
+        return [Path(name) for name in sorted(glob.glob(str(path)))] or [Path(path)]
+    return [Path(path)]
+
+
 def list_images(images: Sequence[str | Path]) -> list[Path]:
     """Picture files, and those of the folders named; FileNotFoundError or ValueError where there are none.
 
@@ -296,7 +306,7 @@ def list_images(images: Sequence[str | Path]) -> list[Path]:
     """
     files: list[Path] = []
     skipped: list[Path] = []
-    for path in map(Path, images):
+    for path in chain.from_iterable(map(_matching, images)):
         if path.is_dir():
             if path.name in (".", "..") or not is_leftover(path.name) or len(images) == 1:
                 inside = [entry for entry in path.iterdir() if not entry.is_dir()]

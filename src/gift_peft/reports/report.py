@@ -18,14 +18,14 @@ from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
 from gift_peft.evaluation.tables import comparison_table, group_table, protocol_note, uncertainty_table
-from gift_peft.files import check_inputs_stay, reason, write_whole
+from gift_peft.files import check_inputs_stay, check_own_file, reason, write_whole
 from gift_peft.images import list_images
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.ablation import ablation_table, is_ablation
 from gift_peft.reports.compare import write_compare
 from gift_peft.reports.curves import draw_dynamics, draw_retention
 from gift_peft.reports.figures import Panel, before_after, error_maps
-from gift_peft.reports.model_card import model_card
+from gift_peft.reports.model_card import MARK, model_card
 from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_names
 from gift_peft.reports.zero_shot import checkpoint_folders, draw_zero_shot
 from gift_peft.rules import GroupPictures
@@ -109,6 +109,8 @@ def run_report(
     if card and not saved[0].arguments:
         raise ValueError(f"{saved[0].path}: no config.yaml, so nothing says what was trained; name the run's folder")
     planned = [run for run in saved if run.path.is_file()]
+    if card and (planned or card is not True):
+        check_own_file(Path("model_card.md" if card is True else card), MARK, "--model-card")
     if planned and not card:
         raise ValueError(f"{planned[0].path}: not a run yet; --model-card FILE writes the card of what it will be")
     if planned:

@@ -200,7 +200,13 @@ def to_mask(image: Image.Image, name: str, target_class: int | Sequence[int] | N
     """
     if image.mode == "P" and target_class is not None:
         return _palette_class(image, name, np.atleast_1d(target_class))
-    values = np.asarray(image) if image.mode in SINGLE_CHANNEL and image.mode != "P" else _grey(image, name)
+    if image.mode == "F":  # what NumPy users save: 0.0 and 1.0, or 0.0 and 255.0
+        values = np.asarray(image)
+        if not (values == np.round(values).clip(0, 65535)).all():  # NaN as well
+            raise ValueError(f"{name}: its values are fractions, negative or not finite; save it as black and white")
+        values = values.astype(np.int64)
+    else:
+        values = np.asarray(image) if image.mode in SINGLE_CHANNEL and image.mode != "P" else _grey(image, name)
     if values.dtype == bool:
         return values if target_class is None else np.isin(values * 255, target_class) | np.isin(values, target_class)
     levels = (

@@ -1,4 +1,4 @@
-"""Files that hold several pictures, stand for one that is elsewhere, or are named by a pattern."""
+"""Files of several pictures, of floats, that stand for a file elsewhere, or that are named by a pattern."""
 
 import numpy as np
 import pytest
@@ -33,6 +33,17 @@ def test_previews_and_second_views_are_no_second_picture(tmp_path):
     photo = Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 96, 3), np.uint8))
     photo.save(tmp_path / "photo.jpg", format="MPO", save_all=True, append_images=[photo.rotate(180)])
     assert open_image(tmp_path / "photo.jpg").size == photo.size
+
+
+@pytest.mark.parametrize("high", [1, 255])
+def test_masks_of_floats(tmp_path, high):
+    path = tmp_path / "1.tif"
+    Image.fromarray(BOX.astype(np.float32) * high).save(path)
+    np.testing.assert_array_equal(MaskSource(path, "png").read(SIZE), BOX)
+    for other in (0.5, np.nan, np.inf, -1.0):
+        Image.fromarray(np.where(BOX, np.float32(high), np.float32(other))).save(path)
+        with pytest.raises(ValueError, match=r"1\.tif: its values are fractions, negative or not finite"):
+            MaskSource(path, "png").read(SIZE)
 
 
 def test_pointers_of_git_lfs(tmp_path):

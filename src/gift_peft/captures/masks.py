@@ -197,11 +197,11 @@ def explain_missing(image_path: Path, group_dir: Path, root: Path) -> str:
 
 def _unread(image_path: Path, group_dir: Path, root: Path, listing: Listing) -> list[str]:
     """Files that may hold masks in a form that is not read, by their places in the tree."""
-    within = [image_path.parent, group_dir, group_dir.parent, root]
+    within = [image_path.parent, *_bases(group_dir, root)]
     folders = [path for folder in within for path in (folder, *listing.subfolders(folder, MORE_FOLDERS))]
     found = []
     for folder in dict.fromkeys(folders):
-        below = folder not in (group_dir.parent, root)  # above the group, text files are notes and lists
+        below = folder.is_relative_to(group_dir)  # above the group, text files are notes and lists
         for path in listing.entries(folder):
             kind = path.suffix.lower()
             if _is_strange_json(path, root, image_path) if kind == ".json" else kind in UNREAD and below:

@@ -21,11 +21,13 @@ from gift_peft.files import (
     reason,
     remove_files,
     strangers,
+    unfetched,
     whole_folder,
     write_whole,
 )
 from gift_peft.models.convert import convert_vggt
 from gift_peft.models.identity import check_base_name
+from gift_peft.models.loading import load_base
 from gift_peft.reports import model_card, targets_page
 
 ROOT = Path(__file__).parents[1]
@@ -139,6 +141,16 @@ def test_an_output_never_is_an_input(tmp_path):
     with pytest.raises(ValueError, match="would replace the input"):  # an input that is a link: the link stays too
         check_inputs_stay([tmp_path / "ALIAS.png"], [tmp_path / "alias.png"])
     check_inputs_stay([photos / "kitchen.npy", tmp_path / "Photos/Kitchen.PNG", tmp_path / "new/kitchen.png"], inputs)
+
+
+def test_weights_that_were_not_fetched(tmp_path):
+    (tmp_path / "model.safetensors").write_text(
+        "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 9\n"
+    )
+    shutil.copy(ROOT / "src/gift_peft/demo/base/config.json", tmp_path)
+    with pytest.raises(ValueError, match=r"base model .*: of model\.safetensors only Git LFS's pointer is there"):
+        load_base(tmp_path)
+    assert unfetched(ROOT / "src/gift_peft/demo/base") is None and unfetched("somebody/on-the-hub") is None
 
 
 def test_a_folder_is_never_seen_half_deleted(tmp_path, monkeypatch):

@@ -194,6 +194,16 @@ def is_lfs_pointer(start: bytes) -> bool:
     return start.startswith(b"version https://git-lfs")
 
 
+def unfetched(folder: str | Path) -> str | None:
+    """What to say of a folder of weights of which only Git LFS's pointers are there; None if they are all there."""
+    for path in sorted(Path(folder).glob("*")) if Path(folder).is_dir() else ():
+        if path.suffix in (".safetensors", ".bin") and path.is_file():
+            with open(path, "rb") as file:
+                if is_lfs_pointer(file.read(32)):
+                    return f"of {path.name} only Git LFS's pointer is there: `git lfs pull` fetches it"
+    return None
+
+
 # ---- small files ----
 
 

@@ -203,9 +203,11 @@ def _tables(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> N
     """One comparison per dataset and protocol, with intervals and groups of every report behind it."""
     together: dict[tuple, list[tuple[str, str, Report]]] = {}
     for run, name, own in zip(runs, names, folder_names(runs), strict=True):
-        for report in run.evaluations.values():
-            key = (_dataset(report), report.unit, protocol_note(report))
-            together.setdefault(key, []).append((_scaled(name, report), own, report))
+        kinds = {place: (_dataset(one), one.unit, protocol_note(one)) for place, one in run.evaluations.items()}
+        for place, report in run.evaluations.items():
+            again = list(kinds.values()).count(kinds[place]) > 1  # evaluated twice this way: the folder tells which
+            called = _scaled(f"{name} ({place})" if again else name, report)
+            together.setdefault(kinds[place], []).append((called, own, report))
     used: dict[str, int] = {}
     for (dataset, *_), entries in together.items():
         used[dataset] = used.get(dataset, 0) + 1

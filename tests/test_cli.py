@@ -240,7 +240,7 @@ def test_demo_passes_training_arguments_on(monkeypatch, run):
     seen = {}
     monkeypatch.setattr("gift_peft.demo.run.run_demo", lambda **given: seen.update(given))
     assert run("demo", "--out", "there", "--seed", "2", "--lambda_d=0")[0] == 0
-    assert seen == {"out": "there", "overwrite_output_dir": False, "seed": 2, "extra": ["--lambda-d=0"]}
+    assert seen == {"out": "there", "overwrite_output_dir": False, "seed": 2, "target": None, "extra": ["--lambda-d=0"]}
 
 
 @pytest.mark.parametrize("script", ["examples/train_gift.py", "-m gift_peft.training", "-m gift_peft"])

@@ -26,6 +26,8 @@ HOOKS = {  # private name: library, where we use it, what for
     "_BatchNorm": ("torch", "group_step.py", "finds every kind of batch normalization"),
     "_actions": ("argparse", "options.py", "shows each option of the training arguments in one spelling"),
     "_option_string_actions": ("argparse", "options.py", "tells an option from a value"),
+    "_optionals": ("argparse", "training/arguments.py", "takes the options of train out of their one group"),
+    "_group_actions": ("argparse", "training/arguments.py", "and puts them into several"),
 }
 
 
@@ -126,3 +128,7 @@ def test_argparse():
     parser.add_argument("--size")
     assert "size" in {action.dest for action in parser._actions}, gone("_actions")
     assert "--size" in parser._option_string_actions, gone("_option_string_actions")
+    assert "size" in {action.dest for action in parser._optionals._group_actions}, gone("_optionals")
+    group = parser.add_argument_group("more")
+    group._group_actions.append(parser._optionals._group_actions.pop())
+    assert "more:\n  --size" in parser.format_help(), gone("_group_actions")

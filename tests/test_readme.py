@@ -14,6 +14,7 @@ import torch
 import yaml
 from helpers.booster_tree import write_root
 from helpers.demo_folder import write_demo
+from helpers.orderings import write_layered, write_md3k
 from helpers.tiny import SIZE, write_raw_tree
 
 from gift_peft.captures.foreign import read_layout
@@ -34,6 +35,9 @@ ONLY_PARSED = {  # the start of a command: why it is not run here
     "gift-peft train --config examples/": "needs a large model",
     "gift-peft train --config run.yaml": "the file is the reader's",
     "gift-peft prepare RAW gift-i --layout": "needs files in that layout; tests/captures/test_foreign.py has them",
+    "gift-peft predict rgb": "needs files of a sensor; tests/deploy/test_predict_metric.py has them",
+    "gift-peft predict --video": "needs a clip; tests/deploy/test_predict_metric.py has one",
+    "gift-peft evaluate --sensor-depth": "needs files of a sensor; tests/deploy/test_sensor_evaluation.py has them",
     "gift-peft deploy demo/adapter onnx": "exports a minute; tests/deploy/test_onnx_export.py has all forms",
     "gift-peft deploy demo/adapter openvino": "exports a minute; tests/deploy/test_onnx_export.py has all forms",
     "gift-peft deploy demo/adapter int8": "exports a minute; tests/deploy/test_onnx_export.py has all forms",
@@ -68,7 +72,7 @@ def only_parsed(command: str) -> bool:
 
 @pytest.fixture
 def workspace(tmp_path, monkeypatch):
-    """A folder as after `gift-peft demo`, with photos and captures of one's own, and a Booster."""
+    """A folder as after `gift-peft demo`, with photos and captures of one's own, and the benchmarks."""
     with pytest.warns(UserWarning, match="the base is the local folder"):
         write_demo(tmp_path / "demo")
     write_raw_tree(tmp_path / "my-captures")
@@ -78,6 +82,8 @@ def workspace(tmp_path, monkeypatch):
     (tmp_path / "photos" / "masks").rmdir()
     (tmp_path / "photo.jpg").write_bytes((tmp_path / "photos" / "0.png").read_bytes())
     write_root(tmp_path / "booster", scenes=1)
+    write_layered(tmp_path / "layered-depth")
+    write_md3k(tmp_path / "md3k")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

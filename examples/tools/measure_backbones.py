@@ -23,6 +23,8 @@ from gift_peft import (
     GroupStep,
     Metric3DConfig,
     Metric3DForDepthEstimation,
+    MogeConfig,
+    MogeForDepthEstimation,
     VggtConfig,
     VggtForDepthEstimation,
     get_gift_model,
@@ -34,6 +36,8 @@ BACKBONES = {
     "metric3d-small": lambda: Metric3DForDepthEstimation(Metric3DConfig(variant="small")),
     "metric3d-large": lambda: Metric3DForDepthEstimation(Metric3DConfig(variant="large")),
     "metric3d-giant2": lambda: Metric3DForDepthEstimation(Metric3DConfig(variant="giant2")),
+    "moge-2-large": lambda: MogeForDepthEstimation(MogeConfig(num_tokens=1564)),  # those of 476x644
+    "moge-2-large-3600": lambda: MogeForDepthEstimation(MogeConfig(num_tokens=3600)),  # as released
 }
 
 

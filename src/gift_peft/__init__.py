@@ -1,7 +1,8 @@
 """Geometry-invariant fine-tuning (GIFT): depth models learn to see mirrors and glass, without depth labels.
 
-Makes `datasets.load_dataset("gift_i", data_dir=...)` work and transformers' Auto classes know VGGT and Metric3D V2, as
-soon as these packages are imported. The names below are imported when first used: `import gift_peft` is quick.
+Makes `datasets.load_dataset("gift_i", data_dir=...)` work and transformers' Auto classes know VGGT, Metric3D V2 and
+MoGe, as soon as these packages are imported. The names below are imported when first used: `import gift_peft` is
+quick.
 """
 
 import importlib.util
@@ -22,6 +23,8 @@ _HOME = {
     "GroupStep": "group_step",
     "Metric3DConfig": "models.metric3d",
     "Metric3DForDepthEstimation": "models.metric3d",
+    "MogeConfig": "models.moge",
+    "MogeForDepthEstimation": "models.moge",
     "PROTOCOLS": "evaluation.protocols",
     "RECIPES": "adapters.recipes",
     "VggtConfig": "models.vggt",
@@ -30,6 +33,8 @@ _HOME = {
     "depth_metrics": "evaluation.metrics",
     "evaluate_booster": "evaluation.evaluate",
     "evaluate_gift_i": "evaluation.evaluate",
+    "evaluate_layered_depth": "evaluation.layered_depth",
+    "evaluate_md3k": "evaluation.md3k",
     "geometry_consistency_error": "losses",
     "get_gift_model": "adapters.recipes",
     "gift_loss": "losses",

@@ -16,11 +16,11 @@ VERBS = {
     "export": ("dataset.export_verb", "a dataset as parquet shards with a card, to share or stream"),
     "proxies": ("training.proxies_verb", "keep the frozen model's predictions for a dataset"),
     "train": ("training.__main__", "fine-tune a model on groups of images into an adapter"),
-    "evaluate": ("evaluation.verb", "compare base and adapter on validation groups, or on Booster"),
+    "evaluate": ("deploy.evaluate_verb", "compare base and adapter on validation groups, or on a benchmark"),
     "predict": ("predict", "depth of pictures, beside the base's"),
     "deploy": ("deploy.deploy_verb", "an adapter and its base as one model that runs elsewhere"),
     "report": ("reports.report_verb", "tables, figures and model card of runs, from what they left behind"),
-    "convert": ("models.convert_verb", "official VGGT or Metric3D V2 weights to a transformers folder"),
+    "convert": ("models.convert_verb", "official VGGT, Metric3D V2 or MoGe weights to a transformers folder"),
 }
 PACKAGES = ("torch", "transformers", "peft", "accelerate", "datasets")
 

@@ -190,6 +190,21 @@ def read_image(source: str | Path | bytes | Image.Image, name: str | None = None
     return to_rgb(open_image(source, name), name or str(source))
 
 
+def given_picture(image: str | Path | Image.Image | np.ndarray) -> tuple[Image.Image, str]:
+    """(upright RGB picture, what messages call it) of a file, a picture, or an array (H,W,3) or grey (H,W), uint8.
+
+    Raises as `read_image`, and ValueError for anything else.
+    """
+    name = str(image) if isinstance(image, str | Path) else "the picture"
+    if isinstance(image, np.ndarray):
+        if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2 or not image.size:
+            raise ValueError(f"{name}: (H,W,3) uint8 is expected, not {image.shape} {image.dtype}")
+        image = Image.fromarray(image)
+    elif not isinstance(image, str | Path | Image.Image):
+        raise ValueError(f"{name}: a path, a PIL picture or a uint8 array is expected, not {type(image).__name__}")
+    return read_image(image, name), name
+
+
 def to_mask(image: Image.Image, name: str, target_class: int | Sequence[int] | None = None) -> np.ndarray:
     """The (H, W) bool target region of a mask in one channel, or in grey saved as RGB, RGBA, LA or palette.
 

@@ -13,6 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 
@@ -81,7 +82,7 @@ def expand_home(value: Any) -> Any:
     if isinstance(value, list):
         return [expand_home(item) for item in value]
     if isinstance(value, str | os.PathLike) and os.fspath(value).startswith("~"):
-        return type(value)(os.path.expanduser(value))
+        return os.path.expanduser(value) if isinstance(value, str) else Path(value).expanduser()
     return value
 
 

@@ -7,6 +7,7 @@ prediction back to each picture's size, as in transformers' pipeline. Values sta
 import io
 import os
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,12 +17,15 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from tqdm import tqdm
 
+from gift_peft.deploy.metric_options import add_metric_options, check_metric_options, make_outputs, run_video
 from gift_peft.files import check_inputs_stay, write_whole
 from gift_peft.images import list_images
 from gift_peft.options import OptionParser, add_adapter, add_base
 
 if TYPE_CHECKING:
     import torch
+
+    from gift_peft.deploy.metric_outputs import MetricOutputs
 
 
 MARK = ("Software", "gift-peft predict")  # a text in our PNGs: what lacks it is somebody's own
@@ -54,6 +58,8 @@ def predict_images(
     focal_length: float | tuple[float, float] | None = None,
     device: "str | torch.device | None" = None,
     accept_base: bool = False,
+    outputs: "MetricOutputs | None" = None,
+    batch_size: int | None = None,
     deployed: str | Path | None = None,
     backend: str | None = None,
     progress: bool = True,
@@ -70,6 +76,8 @@ def predict_images(
         out: folder; made if missing. What an earlier `predict` left there under these names is replaced, nothing else.
         kind (`str`, *optional*): decides which end is bright; default the recipe's.
         focal_length (*optional*): of the camera in pixels, as in `DepthModel.depth_at`.
+        outputs (`MetricOutputs`, *optional*): what else is written of each picture.
+        batch_size (`int`, *optional*): pictures per forward; default 8 on a GPU, else 1.
         deployed (*optional*): a folder that `gift-peft deploy` exported, in place of base and adapter.
         backend (`str`, *optional*): what computes a deployed model, `onnx` or `openvino`.
 
@@ -82,6 +90,7 @@ def predict_images(
             unreadable pictures, non-finite predictions.
     """
     from gift_peft.colormap import color_range, colorize  # not for `--help`, which needs neither OpenCV nor torch
+    from gift_peft.deploy.look_ahead import predict_ahead
 
     files = list_images(images)
     model: Any = None
@@ -90,9 +99,13 @@ def predict_images(
 
         model = DeployedModel(deployed, backend, adapter_scale)
     beside = adapter is not None if model is None else model.adapted
-    names = _unique_names(files, beside)
+    ends = ["_base"] if beside else []
+    names = _unique_names(files, ends + (outputs.suffixes() if outputs else []))
     folder = Path(out)
-    stems = [stem for name in names for stem in ([name, f"{name}_base"] if beside else [name])]
+    stems = [name + end for name in names for end in ["", *ends]]
+    if outputs is not None:
+        stems += [name + end for name in names for end in outputs.suffixes()]
+        outputs.check(folder, names, _is_ours)
     _check_outputs(folder, stems, files)
     if model is None:
         from gift_peft.models.loading import DepthModel
@@ -102,13 +115,20 @@ def predict_images(
     mark = PngInfo()
     mark.add_text(*MARK)
     made, wrong = [], []
-    for file, name in tqdm(
-        list(zip(files, names, strict=True)), desc="predict", unit="image", disable=None if progress else True
+    results = predict_ahead(model, files, beside, focal_length, batch_size)
+    for file, name, result in tqdm(
+        zip(files, names, results, strict=True),
+        desc="predict",
+        unit="image",
+        total=len(files),
+        disable=None if progress else True,
     ):
         try:
-            depths = {name: model.depth_at(file, focal_length)}
-            if beside:
-                depths[f"{name}_base"] = model.depth_at(file, focal_length, base=True)
+            if isinstance(result, Exception):
+                raise result
+            depths = {name: result["own"]} | ({f"{name}_base": result["base"]} if "base" in result else {})
+            if outputs is not None:
+                outputs.write(folder, name, file, depths[name], model.kind, model.millimeters_per_unit)
         except ValueError as error:  # of this picture: the others are still wanted
             wrong.append(str(error))
             continue
@@ -150,16 +170,16 @@ def _write(path: Path, save: Callable[[io.BytesIO], None]) -> None:
     write_whole(path, content.getvalue())
 
 
-def _unique_names(files: Sequence[Path], beside: bool) -> list[str]:
-    """A file name per picture; `beside` keeps `<name>_base` free as well."""
+def _unique_names(files: Sequence[Path], ends: Sequence[str]) -> list[str]:
+    """A file name per picture; `<name><end>` stays free as well for each of the ends."""
     taken: set[str] = set()
     names = []
     for file in files:
         number, name = 1, file.stem
-        while {name, f"{name}_base"} & taken if beside else name in taken:
+        while {name, *(name + end for end in ends)} & taken:
             number += 1
             name = f"{file.stem}-{number}"
-        taken |= {name, f"{name}_base"} if beside else {name}
+        taken |= {name, *(name + end for end in ends)}
         names.append(name)
     return names
 
@@ -173,7 +193,7 @@ def make_parser() -> OptionParser:
         "Depth of pictures, beside the base's.",
         "gift-peft predict photo.jpg --adapter demo/adapter --out depth",
     )
-    parser.add_argument("images", nargs="+", metavar="IMAGE", help="picture files or folders of them")
+    parser.add_argument("images", nargs="*", metavar="IMAGE", help="picture files or folders of them")
     add_base(parser, required=False)
     add_adapter(parser)
     text = "of the camera that took the pictures, where the model takes one (Metric3D)"
@@ -183,6 +203,7 @@ def make_parser() -> OptionParser:
     text = "what computes a deployed model; default: what it was exported for"
     parser.add_argument("--backend", choices=["onnx", "openvino"], help=text)
     parser.add_argument("--out", "--output-dir", required=True, metavar="DIR", help="folder for the npy and png files")
+    add_metric_options(parser)
     return parser
 
 
@@ -198,7 +219,14 @@ def run(argv: Sequence[str]) -> int:
         parser.error("--backend computes a model named by --deployed")
     elif args.base is None and args.adapter is None:
         parser.error("one of --base, --adapter and --deployed is required")
+    check_metric_options(parser, args)
+    if args.video is not None:
+        if args.deployed is not None:
+            parser.error("--video takes --base or --adapter, not --deployed")
+        return run_video(args)
     reasons: list[str] = []
+    outputs = make_outputs(args)
+    begin = time.perf_counter()
     try:
         files = predict_images(
             args.images,
@@ -211,12 +239,17 @@ def run(argv: Sequence[str]) -> int:
             revision=args.revision,
             focal_length=args.focal_length,
             accept_base=args.accept_base,
+            outputs=outputs,
+            batch_size=args.batch_size,
             deployed=args.deployed,
             backend=args.backend,
         )
     except PicturesWithoutDepth as error:
         files, reasons = error.paths, error.reasons
-    print(f"Depth maps written to {args.out}: {len(files)}")
+    seconds = time.perf_counter() - begin
+    print(f"Depth maps written to {args.out}: {len(files)} ({len(files) / seconds:.2f} a second, loading included)")
+    if outputs is not None and (line := outputs.finish(Path(args.out))):
+        print(line)
     for why in reasons:
         print(f"gift-peft: error: {why}", file=sys.stderr)
     if reasons:

@@ -20,6 +20,7 @@ SPLITS = ("train", "validation")
 SURFACES = ["mirror", "transparent"]
 KINDS = ("depth", "inverse_depth")  # what a model predicts
 MAX_GROUP_ID = 210  # bytes; the names of a group's files are longer, and file systems take 255
+UNKNOWN = float(np.finfo(np.float32).min)  # a proxy where the teacher's own mask says that there is no surface
 
 
 @dataclass(frozen=True, eq=False)

@@ -328,7 +328,8 @@ def test_metrics_do_not_change_under_affine_changes_in_the_fitted_space(seed, sc
 
 
 def test_protocols_state_their_choices():
-    assert list(PROTOCOLS) == ["gift", "native", "gift-literal", "depth4tom", "ntire25", "moge-affine", "metric"]
+    names = ["gift", "native", "gift-literal", "depth4tom", "ntire24", "tricky24", "ntire25", "moge-affine", "metric"]
+    assert list(PROTOCOLS) == [*names, "ntire26"]
     listed = list_protocols()
     for name, protocol in PROTOCOLS.items():
         assert protocol.name == name and protocol.source in listed and f"{name}: " in listed

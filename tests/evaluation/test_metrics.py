@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gift_peft.evaluation.metrics import METRICS, depth_metrics
+from gift_peft.evaluation.metrics import METRICS, depth_metrics, metric_names
 
 
 def by_loop(aligned, reference, region):
@@ -97,3 +97,19 @@ def test_wrong_arguments():
         depth_metrics(ones, ones, ones)
     with pytest.raises(ValueError, match="shapes must agree"):
         depth_metrics(ones, np.ones((2, 3)), ones > 0)
+
+
+def test_stricter_factors_worked_by_hand():
+    reference = np.full((1, 6), 100.0)
+    values = np.array([[100.0, 104.9, 107.0, 112.0, 84.0, -100.0]])  # ratios 1, 1.049, 1.07, 1.12, 1.1905, none
+    found = depth_metrics(values, reference, np.ones((1, 6), bool), (1.05, 1.1, 1.15, 1.2))
+    assert list(found) == list(metric_names((1.05, 1.1, 1.15, 1.2)))
+    expected = {"delta_1.05": 2, "delta_1.10": 3, "delta_1.15": 4, "delta_1.20": 5, "delta1": 5}
+    for name, count in expected.items():
+        assert found[name] == pytest.approx(100 * count / 6, abs=1e-9), name
+    plain = depth_metrics(values, reference, np.ones((1, 6), bool))
+    assert plain == {name: found[name] for name in METRICS}
+    empty = depth_metrics(values, reference, np.zeros((1, 6), bool), (1.05,))
+    assert list(empty) == [*METRICS, "delta_1.05"] and all(map(np.isnan, empty.values()))
+    batch = depth_metrics(np.stack([values] * 2), np.stack([reference] * 2), np.ones((2, 1, 6), bool), (1.05,))
+    assert batch["delta_1.05"].tolist() == [found["delta_1.05"]] * 2

@@ -15,6 +15,7 @@ from gift_peft import evaluate_booster
 from gift_peft.evaluation.verb import run_evaluation
 from gift_peft.models.loading import DepthModel
 from gift_peft.predict import predict_images
+from gift_peft.reports.report import run_report
 
 RAMP = torch.linspace(1, 2, 98)
 
@@ -132,6 +133,18 @@ def test_they_are_evaluated_on_gift_i(packages, raw_tree, tmp_path, capsys):
     assert report.counts["scored"] == 2 and report.base == report.summary and report.gce["adapted"] is None
     assert report.gce["base"] > 0 and report.about["base"] == "da3:known"
     assert "GIFT-I validation" in capsys.readouterr().out
+
+
+def test_the_papers_unadapted_rows_stand_in_one_table(packages, tmp_path, capsys):
+    write_root(tmp_path / "booster")
+    options = {"booster": tmp_path / "booster", "size": "70x98", "progress": False}
+    folders = [tmp_path / name for name in ("da3", "moge")]
+    reports = [run_evaluation(f"{folder.name}:known", out=folder, **options) for folder in folders]
+    run_report(folders, tmp_path / "report", panels=0)
+    table = (tmp_path / "report" / "tables" / "booster.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in table[1:]] == ["da3:known", "moge:known"]
+    for line, report in zip(table[1:], reports, strict=True):
+        assert float(line.split(",")[3]) == pytest.approx(report.summary["tom"]["rmse"], rel=1e-9)
 
 
 def test_what_is_missing_or_wrong_is_one_line(packages, monkeypatch):

@@ -173,7 +173,7 @@ BROKEN = {
         lambda g: [replaced(g, 0, np.zeros((*SIZE, 3), np.uint8)), (g / "group.yaml").write_text("static_rig: true")],
         "black pixels",
     ),
-    "moved too far": (lambda g: shifted(g, 50), "moves by"),
+    "moved too far": (lambda g: shifted(g, 50), "the camera moved too far"),
     "target that does not change": (unchanged, "the group teaches nothing"),
 }
 

@@ -21,6 +21,8 @@ from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, D
 from gift_peft import (
     Metric3DConfig,
     Metric3DForDepthEstimation,
+    MogeConfig,
+    MogeForDepthEstimation,
     VggtConfig,
     VggtForDepthEstimation,
     get_gift_model,
@@ -247,6 +249,7 @@ CARDS = {
     "depth_anything_v2_large": ("depth-anything/Depth-Anything-V2-Large-hf", "cc-by-nc-4.0", "335,315,649"),
     "vggt_1b": ("facebook/VGGT-1B", "cc-by-nc-4.0", "941,766,882"),
     "metric3d_v2_giant": ("JUGGHM/Metric3D", "unknown", "1,377,675,099"),
+    "moge_2_large": ("Ruicheng/moge-2-vitl-normal", "mit", "330,901,544"),
 }
 ROOT = Path(__file__).parents[2]
 
@@ -281,6 +284,11 @@ def depth_anything_v2_large():
     return DepthAnythingForDepthEstimation(DepthAnythingConfig(backbone_config=backbone, head_hidden_size=32, **neck))
 
 
+def moge_2_large():
+    pytest.importorskip("moge.model.v2", reason="MoGe (dlr-moge) is not installed")
+    return MogeForDepthEstimation(MogeConfig())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "build"),
@@ -288,6 +296,7 @@ def depth_anything_v2_large():
         ("depth-anything/Depth-Anything-V2-Large-hf", depth_anything_v2_large),
         ("facebook/VGGT-1B", lambda: VggtForDepthEstimation(VggtConfig())),
         ("JUGGHM/Metric3D", lambda: Metric3DForDepthEstimation(Metric3DConfig())),
+        ("Ruicheng/moge-2-vitl-normal", moge_2_large),
     ],
 )
 @pytest.mark.parametrize("head", ["full", "lora", "none"])
@@ -330,4 +339,4 @@ def test_the_templates_are_part_of_the_wheel():
     patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     folder = ROOT / "src" / "gift_peft" / "reports"
     packed = {path for pattern in patterns["gift_peft.reports"] for path in folder.glob(pattern)}
-    assert len(packed) == 5 and packed == {path for path in folder.rglob("*.*") if path.suffix in (".md", ".html")}
+    assert len(packed) == 6 and packed == {path for path in folder.rglob("*.*") if path.suffix in (".md", ".html")}

@@ -22,7 +22,8 @@ from gift_peft import cli
 from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.verb import run_evaluation
 from gift_peft.reports.ablation import ablation_table, is_ablation
-from gift_peft.reports.report import notable_observations, run_report
+from gift_peft.reports.chosen import notable_observations
+from gift_peft.reports.report import run_report
 from gift_peft.reports.saved_run import SavedRun, read_run, run_names
 from gift_peft.reports.zero_shot import checkpoint_folders
 from gift_peft.training import train
@@ -331,7 +332,7 @@ def test_booster_has_its_own_tables_and_pictures(run_folder, base_dir, tmp_path,
     # The caption's error is the table's: the same alignment on the same grid.
     rows = (run_folder / "booster" / "rows.jsonl").read_text().splitlines()
     errors = [json.loads(row)["base"]["tom"]["rmse"] for row in rows]
-    assert f"RMSE in the outline: {max(errors):.0f} mm before" in page
+    assert f"RMSE in the outline: {max(errors):,.0f} mm before" in page
     results = ModelCard.load(folder / "model_card.md").data.eval_results
     assert [result.dataset_type for result in results] == 12 * ["booster"]
     shutil.rmtree(tmp_path / "booster")

@@ -56,7 +56,7 @@ def test_every_mistake_is_told_at_once(base_dir, tmp_path, dry):
     tree = write_raw_tree(tmp_path / "raw", train=(2,), validation=())
     write_group(tree / "train/alone", 1, 9)
     (tmp_path / "run").mkdir()
-    (tmp_path / "run/metrics.jsonl").write_text("{}\n")
+    (tmp_path / "run/metrics.jsonl").write_text('{"step": 0, "epoch": 0, "loss": 1, "train_gce": 1}\n')
     code, told = dry(tmp_path / "nowhere", tree, tmp_path / "run")
     wrong = [line for line in told.splitlines() if line.startswith("A run would fail: ")]
     assert code == 1 and len(wrong) == 3 and "Nothing was written." in told

@@ -161,7 +161,8 @@ def test_signals_checkpoint_after_the_group_and_say_how_to_go_on(
 ):
     config = tmp_path / "c.yaml"
     config.write_text(args.to_yaml())
-    before = signal.getsignal(signum)
+    before = signal.default_int_handler if signum == signal.SIGINT else signal.SIG_DFL
+    signal.signal(signum, before)  # as from a terminal, whatever started the tests
     with monkeypatch.context() as patch:
         stop = on_call(3, GroupStep.accumulate, lambda *a: os.kill(os.getpid(), signum))
         patch.setattr(GroupStep, "accumulate", stop)
@@ -169,8 +170,7 @@ def test_signals_checkpoint_after_the_group_and_say_how_to_go_on(
             cli.main(["train", "--config", str(config)])
     assert exit.value.code == code
     assert signal.getsignal(signum) == before
-    command = capsys.readouterr().out.strip().splitlines()[-1].split()
-    assert command[:2] == ["gift-peft", "train"]
+    assert (command := capsys.readouterr().out.strip().splitlines()[-1].split())[:2] == ["gift-peft", "train"]
     assert checkpoints.checkpoint_fault(tmp_path / "out/checkpoint-3") is None
     with pytest.raises(SystemExit) as exit:
         cli.main(command[1:])

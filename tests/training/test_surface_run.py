@@ -308,5 +308,5 @@ def test_nothing_to_choose_by(base_dir, tmp_path, capsys):
     raw = write_raw_tree(tmp_path / "raw", train=(1, 2), validation=())
     write_group(raw / "validation/scene_100", 2, 100)
     result = train(arguments(base_dir, raw, tmp_path / "out", **SURFACE, metric_for_best_model="tom_rmse"))
-    assert result.best_step is None and "has a treated reference" in capsys.readouterr().out
+    assert result.best_step is None and "has a photo of the treated surface" in capsys.readouterr().out
     assert weights(tmp_path / "out/adapter").keys() == weights(tmp_path / "out/adapter-last").keys()

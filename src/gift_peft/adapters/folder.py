@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from peft import LoraConfig, PeftConfig, PeftModel
-from peft.tuners.lora import LoraLayer
 
-from gift_peft.adapters.scale import active_lora, active_saved_modules
+from gift_peft.adapters.scale import active_lora, active_saved_modules, full_scaling
 from gift_peft.files import check_replaceable, is_hub_id, jsonable, reason, whole_folder
 from gift_peft.rules import KINDS
 
@@ -55,7 +54,7 @@ def save_adapter(
         raise ValueError(
             "save_adapter needs a PeftModel whose adapter is called 'default', as get_gift_model makes it"
         )
-    if any(layer.scaling[name] != _full_scaling(layer, name) for layer, name in active_lora(model)) or any(
+    if any(layer.scaling[name] != full_scaling(layer, name) for layer, name in active_lora(model)) or any(
         vars(wrapper).get("_gift_trained") for wrapper, _ in active_saved_modules(model)
     ):
         raise ValueError("an adapter is saved at scale 1: call set_adapter_scale(model, 1) first")
@@ -74,11 +73,6 @@ def save_adapter(
         _write_json(temporary / GIFT, _gift_json(gift, size))
         # Last: PEFT writes a README of its own, which names a local base path.
         (temporary / "README.md").write_text(card or _minimal_card(hub_base), encoding="utf-8")
-
-
-def _full_scaling(layer: LoraLayer, name: str) -> float:
-    rank = layer.r[name]
-    return layer.lora_alpha[name] / (math.sqrt(rank) if layer.use_rslora.get(name) else rank)
 
 
 def _base_name(model: PeftModel) -> str | None:

@@ -32,6 +32,8 @@ class GiftRecipe:
         modules_to_save: modules of the depth head, trained in full (`head="full"`) or by LoRA (`head="lora"`).
         kind: what the model predicts, "depth" or "inverse_depth"; None follows `config.depth_estimation_type`.
         size: (height, width) of the model's input; None takes it from the image processor.
+        where_present (`bool`): `modules_to_save` lists what several versions of a network have: those that this one
+            lacks are left out, all but one.
         lora: further `LoraConfig` arguments, such as `{"lora_alpha": 16}`.
     """
 
@@ -39,6 +41,7 @@ class GiftRecipe:
     modules_to_save: list[str]
     kind: str | None = None
     size: tuple[int, int] | None = None
+    where_present: bool = False
     lora: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -73,6 +76,20 @@ RECIPES: dict[str, GiftRecipe] = {
         modules_to_save=["depth_model.decoder"],
         kind="depth",
         size=(476, 644),
+    ),
+    "gift_moge": GiftRecipe(
+        target_modules=r"network\.(encoder\.)?backbone\.blocks\.\d+\.attn\.(qkv|proj)",
+        # MoGe-2: what leads from tokens to points and their scale, but neither mask nor normals; MoGe: its one head.
+        modules_to_save=[
+            "network.encoder.output_projections",
+            "network.neck",
+            "network.points_head",
+            "network.scale_head",
+            "network.head",
+        ],
+        kind="depth",
+        size=(476, 644),
+        where_present=True,
     ),
 }
 
@@ -109,7 +126,7 @@ def get_gift_model(model: nn.Module, rank: int = 8, head: str = "full", recipe: 
         raise ValueError(f"head must be one of {', '.join(HEADS)}, got {head!r}")
     recipe = get_recipe(model, recipe)
     _check_base(model)
-    saved = _head_modules(model, recipe.modules_to_save) if head != "none" else []
+    saved = _head_modules(model, recipe.modules_to_save, recipe.where_present) if head != "none" else []
     targets = recipe.target_modules
     if not any(re.fullmatch(_pattern(targets), name) for name, _ in model.named_modules()):
         raise ValueError(f"target_modules: {targets!r} names no module of this {type(model).__name__}")
@@ -137,16 +154,18 @@ def _check_base(model: nn.Module) -> None:
             )
 
 
-def _head_modules(model: nn.Module, names: list[str]) -> list[str]:
+def _head_modules(model: nn.Module, names: list[str], where_present: bool = False) -> list[str]:
     """Full paths of the modules called `names`, so written that PEFT finds these and no others.
 
     PEFT takes every module whose path ends with a given text: `head` means `metric_head` as well, and the `head.head`
     inside `head`, which it would wrap twice. Such a module is written as its parts.
     """
     keys = [key for key, _ in model.named_modules()]
+    found_by_name = {name: [key for key in keys if key == name or key.endswith(f".{name}")] for name in names}
+    if where_present:
+        found_by_name = {name: found for name, found in found_by_name.items() if found} or found_by_name
     wanted = []
-    for name in names:
-        found = [key for key in keys if key == name or key.endswith(f".{name}")]
+    for name, found in found_by_name.items():
         if not found:
             similar = [key for key in keys if key.endswith(name)]
             hint = f" (there are {', '.join(similar[:4])})" if similar else ""
@@ -158,9 +177,9 @@ def _head_modules(model: nn.Module, names: list[str]) -> list[str]:
 
 def _unambiguous(model: nn.Module, path: str, keys: list[str], wanted: list[str]) -> list[str]:
     others = [key for key in keys if key.endswith(path) and key != path and key not in wanted]
-    if not others:
-        return [path]
     module = model.get_submodule(path)
+    if not others and not isinstance(module, nn.ModuleList):  # PEFT wraps what has a forward
+        return [path]
     parts = [name for name, child in module.named_children() if next(child.parameters(), None) is not None]
     if not parts or next(module.parameters(recurse=False), None) is not None:
         raise ValueError(f"modules_to_save: PEFT would take {path!r} for {', '.join(others[:4])} as well")

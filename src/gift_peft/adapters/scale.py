@@ -57,6 +57,21 @@ def set_adapter_scale(model: nn.Module, scale: float) -> None:
         _scale_saved_module(wrapper, name, state, scale)
 
 
+def adapter_scale(model: nn.Module) -> float:
+    """The scale that `set_adapter_scale` set last, 1 if none; ValueError without an active adapter."""
+    for wrapper, name in active_saved_modules(model):
+        return vars(wrapper).get("_gift_trained", {}).get(name, (1.0,))[0]
+    for layer, name in active_lora(model):
+        return layer.scaling[name] / full_scaling(layer, name)
+    raise ValueError("the model has no active LoRA adapter")
+
+
+def full_scaling(layer: LoraLayer, name: str) -> float:
+    """What PEFT multiplies a LoRA by at scale 1."""
+    rank = layer.r[name]
+    return layer.lora_alpha[name] / (math.sqrt(rank) if layer.use_rslora.get(name) else rank)
+
+
 def _scale_saved_module(wrapper: ModulesToSaveWrapper, name: str, trained: dict[str, torch.Tensor], scale: float):
     base = wrapper.original_module.state_dict()
     for key, value in wrapper.modules_to_save[name].state_dict().items():

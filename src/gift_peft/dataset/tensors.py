@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gift_peft.models.pixels import normalize_pixels, resize_images, resize_mask
-from gift_peft.rules import GroupPictures, parse_group
+from gift_peft.rules import UNKNOWN, GroupPictures, parse_group
 
 if TYPE_CHECKING:  # torch takes longer to import than the command line takes to answer --help
     import torch
@@ -24,7 +24,8 @@ class Group:
         names (`list[str]`): N image names, for messages and per-sample rows.
         pixel_values (`torch.Tensor`): (N, 3, h, w) float32.
         mask (`torch.Tensor`): (N, h, w) bool, the target (non-Lambertian) region.
-        valid (`torch.Tensor`, *optional*): (N, h, w) bool, False where a warped frame has no pixels.
+        valid (`torch.Tensor`, *optional*): (N, h, w) bool, False where a warped frame has no pixels, and where the
+            teacher's own mask says that there is no surface (sky).
         target (`torch.Tensor`, *optional*): (N, h, w) float32 proxies in native units.
         reference_pixel_values (`torch.Tensor`, *optional*): (1, 3, h, w) float32, the treated reference.
         reference_target (`torch.Tensor`, *optional*): (h, w) float32, the teacher's prediction on it.
@@ -97,12 +98,16 @@ def to_group(
 
     target, reference_target = (_sized_proxies(part, size, group_id) for part in proxies)
     surface_target, surface_target_flipped = (_sized_proxies(part, size, group_id) for part in targets)
+    valid = torch.from_numpy(arrays["valids"]) if "valids" in arrays else None
+    if target is not None and (unknown := target == UNKNOWN).any():
+        valid = ~unknown if valid is None else valid & ~unknown
+        target = target.masked_fill(unknown, 0)  # no loss reads it, but the largest value of an image counts
     return Group(
         group_id=group_id,
         names=list(names),
         pixel_values=normalize_pixels(arrays["images"], processor),
         mask=torch.from_numpy(arrays["masks"]),
-        valid=torch.from_numpy(arrays["valids"]) if "valids" in arrays else None,
+        valid=valid,
         target=target,
         reference_pixel_values=normalize_pixels(arrays["reference"], processor) if "reference" in arrays else None,
         reference_target=reference_target,

@@ -6,6 +6,7 @@ what Eq. 3 pulls towards. Scores are taken on the CPU in float64, image by image
 the other groups or their order.
 """
 
+import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -23,9 +24,10 @@ from gift_peft.dataset.tensors import Group
 from gift_peft.evaluation.alignment import align, known, resize_prediction
 from gift_peft.evaluation.booster_scenes import TOM_CLASSES, BoosterScene, GroundTruth, find_booster, read_ground_truth
 from gift_peft.evaluation.fitting import DegenerateFitError
-from gift_peft.evaluation.metrics import METRICS, depth_metrics
-from gift_peft.evaluation.protocols import Protocol, get_protocol
+from gift_peft.evaluation.metrics import depth_metrics, metric_names
+from gift_peft.evaluation.protocols import MILLIMETERS, Protocol, get_protocol
 from gift_peft.evaluation.results import REGIONS, Report, make_report
+from gift_peft.evaluation.safety import Flicker, false_free_space
 from gift_peft.evaluation.samples import (
     Observation,
     Predictor,
@@ -65,7 +67,7 @@ def evaluate_gift_i(
     A row of the result: `group_id`, `image`, `surface`, `skipped` (None or why), `target_pixels`, `pixels` ({region:
     pixels with a known reference}), and for each of `base`, `adapted`, `consensus`: `target_mean` and `spread`
     (P95-P5) of the prediction in native units, `scale`, `shift`, `num_clipped`, `num_nonpositive` of its alignment,
-    and the metrics of `all`, `tom` and `other`.
+    and the metrics of `all`, `tom` and `other`; against depth also `false_free_space`.
 
     Args:
         dataset: rows of `load_gift_i`, or ready `Group`s, read by index; or a path or hub id, of which the validation
@@ -114,7 +116,8 @@ def evaluate_gift_i(
     predictors = _predictors(depth_model, baseline, batch_size)
     models = [*predictors, *(["consensus"] if "base" in predictors else [])]
     scale = prediction_scale or (1.0 if rules.fits_scale else depth_model.millimeters_per_unit)
-    task = Task(models, rules, kind, scale, NO_PROXY if reference == "proxy" else NO_DEPTH)
+    in_mm = reference == "depth"
+    task = Task(models, rules, kind, scale, NO_DEPTH if in_mm else NO_PROXY, in_mm)
 
     def read(index: int) -> Sample:
         return gift_i_sample(dataset[index], depth_model, predictors, reference, "consensus" in models)
@@ -207,7 +210,7 @@ def evaluate_booster(
         def predict(scene: BoosterScene, truth: GroundTruth) -> Iterable[dict[str, Any]]:
             return ({"base": stored.read(scene, image)} for image in scene.images)
 
-    task = Task(models, rules, kind, scale, NO_DEPTH)
+    task = Task(models, rules, kind, scale, NO_DEPTH, in_mm=True)
 
     def read(index: int) -> Sample:
         scene = booster.scenes[index]
@@ -258,6 +261,7 @@ class Task:
         protocol, kind: as in `align`.
         prediction_scale (`float`): what predictions are multiplied by first.
         missing (`str`): why a row without a reference is skipped.
+        in_mm (`bool`): the reference is depth, so that safety can be measured.
     """
 
     models: list[str]
@@ -265,6 +269,7 @@ class Task:
     kind: str
     prediction_scale: float
     missing: str
+    in_mm: bool
 
 
 def _evaluate(
@@ -287,6 +292,7 @@ def _score_group(sample: Sample, task: Task) -> tuple[dict, list[dict]]:
     """The group's GCE and its rows."""
     rows, masks, valids = [], [], []
     maps = {name: [] for name in task.models if name != "consensus"}
+    flicker = {name: Flicker() for name in maps}
     for observation in sample.observations:
         score = Scorer(observation, task)
         row = {"group_id": sample.group_id, "image": observation.name, **sample.told, "skipped": None}
@@ -297,8 +303,13 @@ def _score_group(sample: Sample, task: Task) -> tuple[dict, list[dict]]:
             if name in maps:
                 maps[name].append(small)
             row[name] = _native_statistics(small, observation)
-            scores, skipped = score(prediction)
+            scores, aligned, skipped = score(prediction)
             row[name] |= scores
+            if task.in_mm and name in maps:
+                row[name]["false_free_space"] = math.nan
+                if aligned is not None and observation.reference is not None:
+                    row[name]["false_free_space"] = false_free_space(aligned, observation.reference, score.target)
+                    flicker[name].update(aligned, score.target)
             if skipped and not row["skipped"]:
                 row["skipped"] = skipped.format(model=name)
         rows.append(row)
@@ -309,6 +320,8 @@ def _score_group(sample: Sample, task: Task) -> tuple[dict, list[dict]]:
         error = GeometryConsistencyError()
         group[f"gce_{name}"] = error.update(*_on_one_grid(depths, masks, valids))
         group[f"gce_{name}_normalized"] = error.compute_normalized()
+        if task.in_mm:
+            group[f"flicker_{name}"] = flicker[name].compute()
         group["counted"] = error.num_groups == 1  # False: no two target masks overlap
     return group, rows
 
@@ -321,28 +334,33 @@ class Scorer:
         mask = observation.mask
         valid = np.ones(mask.shape, bool) if observation.valid is None else observation.valid
         there = np.zeros(mask.shape, bool) if self.reference is None else valid & known(self.reference)
+        self.unit = MILLIMETERS[task.protocol.unit]
+        if self.reference is not None and self.unit != 1:
+            self.reference = self.reference / self.unit
         self.regions = {"all": there, "tom": there & mask, "other": there & ~mask}
         self.pixels = {name: int(np.count_nonzero(self.regions[name])) for name in REGIONS}
-        self.target_pixels = int(np.count_nonzero(mask & valid))
+        self.target = mask & valid
+        self.target_pixels = int(np.count_nonzero(self.target))
 
-    def __call__(self, prediction: Any) -> tuple[dict, str | None]:
-        """Scores of a (h,w) prediction of any size; NaN and the reason where there is nothing to compare."""
+    def __call__(self, prediction: Any) -> tuple[dict, np.ndarray | None, str | None]:
+        """Scores and aligned (H,W), in mm or native units, of a (h,w) prediction; NaN and why without a reference."""
         task = self.task
         nothing = {"scale": float("nan"), "shift": float("nan"), "num_clipped": 0, "num_nonpositive": 0}
-        nothing |= {region: dict.fromkeys(METRICS, float("nan")) for region in REGIONS}
+        thresholds = task.protocol.thresholds
+        nothing |= {region: dict.fromkeys(metric_names(thresholds), float("nan")) for region in REGIONS}
         if self.reference is None or self.pixels["all"] < 2:
-            return nothing, task.missing
+            return nothing, None, task.missing
         prediction = resize_prediction(prediction, self.reference.shape)
-        if task.prediction_scale != 1:
-            prediction = prediction * task.prediction_scale
+        if (scale := task.prediction_scale / self.unit) != 1:
+            prediction = prediction * scale
         try:
             alignment = align(prediction, self.reference, self.regions["all"], task.protocol, task.kind)
         except DegenerateFitError:
-            return nothing, "with a constant {model} prediction"
+            return nothing, None, "with a constant {model} prediction"
         scores = {name: getattr(alignment, name) for name in ("scale", "shift", "num_clipped", "num_nonpositive")}
         for name in REGIONS:
-            scores[name] = depth_metrics(alignment.aligned, self.reference, self.regions[name])
-        return scores, None
+            scores[name] = depth_metrics(alignment.aligned, self.reference, self.regions[name], thresholds)
+        return scores, alignment.aligned * self.unit, None
 
 
 def _at_most(prediction: Any, limit: tuple[int, int] | None) -> torch.Tensor:

@@ -5,9 +5,19 @@ Every table prints the protocol it was made with. `gift` is the paper's affine-a
 are what published evaluators do, so that numbers can be compared with theirs.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from gift_peft.rules import KINDS
+
+METRICS = ("mae", "abs_rel", "rmse", "delta1")
+
+
+def metric_names(thresholds: Sequence[float] = ()) -> tuple[str, ...]:
+    """The keys of `depth_metrics` with these thresholds: `delta_1.05` is the percentage within a factor of 1.05."""
+    return (*METRICS, *(f"delta_{threshold:.2f}" for threshold in thresholds))
+
 
 # A choice that nothing computes must not stand under a table.
 CHOICES = {
@@ -18,7 +28,9 @@ CHOICES = {
     "floor": (None, "ref_max"),
     "nonpositive": ("far", "near"),
     "expects": (None, *KINDS),
+    "unit": ("mm", "cm", "native"),
 }
+MILLIMETERS = {"mm": 1.0, "cm": 10.0, "native": 1.0}  # in a protocol's unit
 
 
 @dataclass(frozen=True)
@@ -42,7 +54,9 @@ class Protocol:
             the lower one. (0 is infinitely far in both.)
         resolution (`float`, *optional*): metrics are taken on the reference's grid times this factor; None leaves it
             to the evaluation, whose report states it.
-        unit (`str`): unit of the reference that `clip` is meant for, `mm` or `native`.
+        unit (`str`): of the reference, the clip range, MAE and RMSE: `mm`, `cm` or `native`.
+        thresholds (`tuple[float, ...]`): further deltas in the report, beside that of 1.25.
+        ranked_by (`str`, *optional*): the metric of the target by which the published benchmark ranks.
         expects (`str`, *optional*): what the published evaluator takes stored predictions for, where nobody says.
         source (`str`): where the choices come from.
 
@@ -61,6 +75,8 @@ class Protocol:
     resolution: float | None = None
     unit: str = "mm"
     expects: str | None = None
+    thresholds: tuple[float, ...] = ()
+    ranked_by: str | None = None
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -69,6 +85,11 @@ class Protocol:
             if value not in choices:
                 known = ", ".join(map(str, choices))
                 raise ValueError(f"protocol {self.name!r}: {name} {value!r}; what is computed is {known}")
+        if any(not 1 < threshold < math.inf for threshold in self.thresholds):
+            raise ValueError(f"protocol {self.name!r}: thresholds {self.thresholds}; each is a factor above 1")
+        if self.ranked_by not in (None, *metric_names(self.thresholds)):
+            names = ", ".join(metric_names(self.thresholds))
+            raise ValueError(f"protocol {self.name!r}: ranked_by {self.ranked_by!r}; what is computed is {names}")
         if self.clip is not None and not self.clip[0] < self.clip[1]:
             raise ValueError(f"protocol {self.name!r}: clip {self.clip}; the lower end comes first")
         if self.clip is None and self.floor is None and self.space in ("auto", "inverse"):
@@ -102,14 +123,22 @@ class Protocol:
         parts.append("image mean")
         if self.resolution is not None:
             parts.append(f"resolution x{self.resolution:g}")
+        if self.ranked_by:
+            parts.append(f"ranked by {_in_words(self.ranked_by)} on ToM")
         return ", ".join(parts)
 
     def to_dict(self) -> dict:
         """The choices as JSON types."""
-        return asdict(self) | {"clip": None if self.clip is None else list(self.clip)}
+        clip = None if self.clip is None else list(self.clip)
+        return asdict(self) | {"clip": clip, "thresholds": list(self.thresholds)}
+
+
+def _in_words(metric: str) -> str:
+    return {"mae": "MAE", "abs_rel": "AbsRel", "rmse": "RMSE"}.get(metric, metric.replace("_", " "))
 
 
 WORKING_RANGE = (1.0, 10000.0)  # mm: Booster's evaluators drop ground truth outside of it
+STRICT = (1.05, 1.10, 1.15, 1.20)  # of the challenges on Booster, which rank by the first
 _PRESETS = (
     Protocol(
         "gift",
@@ -139,10 +168,32 @@ _PRESETS = (
         source="Costanzino et al., ICCV 2023, evaluate_mono.py of CVLAB-Unibo/Depth4ToM-code (least squares)",
     ),
     Protocol(
+        "ntire24",
+        space="depth",
+        clip=WORKING_RANGE,
+        resolution=1.0,
+        thresholds=STRICT,
+        ranked_by="delta_1.05",
+        source="NTIRE 2024 challenge on HR depth from images of specular and transparent surfaces, mono track: as "
+        "ntire25",
+    ),
+    Protocol(
+        "tricky24",
+        space="depth",
+        clip=WORKING_RANGE,
+        resolution=0.25,
+        thresholds=STRICT,
+        ranked_by="delta_1.05",
+        source="TRICKY 2024 challenge, monocular depth from images of specular and transparent surfaces: as ntire25, "
+        "at 1028x752, a quarter of Booster's size",
+    ),
+    Protocol(
         "ntire25",
         space="depth",
         clip=WORKING_RANGE,
         resolution=1.0,
+        thresholds=STRICT,
+        ranked_by="delta_1.05",
         source="NTIRE 2025 challenge on HR depth from images of specular and transparent surfaces, mono track: scale "
         "and shift first, evaluated in the depth domain at full resolution (working range: ours)",
     ),
@@ -160,7 +211,18 @@ _PRESETS = (
         space="depth",
         dof="none",
         clip=WORKING_RANGE,
-        source="NTIRE 2026 and Depth Pro on Booster: metric depth, nothing fitted",
+        source="Depth Pro on Booster, and NTIRE 2026 (there in cm: ntire26): metric depth, nothing fitted",
+    ),
+    Protocol(
+        "ntire26",
+        space="depth",
+        dof="none",
+        clip=(WORKING_RANGE[0] / 10, WORKING_RANGE[1] / 10),
+        resolution=1.0,
+        unit="cm",
+        ranked_by="rmse",
+        source="NTIRE 2026 challenge, mono track on Booster: metric depth in cm at full resolution, nothing fitted, "
+        "ranked by RMSE on ToM (working range: ours)",
     ),
 )
 PROTOCOLS = {protocol.name: protocol for protocol in _PRESETS}

@@ -32,6 +32,8 @@ class Report:
             `adapted_normalized` (None where that model was not run), `num_groups`, `num_skipped`. On Booster it says
             how much a prediction changes with the light alone, and metrics.json calls it `illumination_gce`.
         collapse (`dict`, *optional*): adapted/base ratios `target_mean_ratio` and `spread_ratio`, and `alarm`.
+        safety (`dict`, *optional*): where depth is known, {`base` | `adapted`: {`false_free_space` (percent of target
+            pixels far behind the surface, mean over images), `flicker` (mm, mean over groups)}}, see `safety.py`.
         by_surface (`dict`): on GIFT-I, {surface: {`num_images` with a scored target, `summary`, `base`, `consensus`}}.
         per_scene (`dict`): on Booster, {scene: {`num_images`, `num_scored`, `summary`, `base`}}.
         counts (`dict`): `groups`, `images`, `scored`, `skipped`, `reasons` ({reason: images}), and
@@ -53,6 +55,7 @@ class Report:
     consensus: dict | None = None
     gce: dict
     collapse: dict | None
+    safety: dict | None = None
     by_surface: dict = field(default_factory=dict)
     per_scene: dict = field(default_factory=dict)
     counts: dict
@@ -108,6 +111,7 @@ class Report:
         values = _parse(path, path.read_text(encoding="utf-8"))
         dataset = "booster" if "illumination_gce" in values else "gift-i"
         names = {key: name for name, key in _json_keys(dataset).items()}
+        values.setdefault("safety", None)  # which evaluations before 0.2 did not have
         for keys, verb in ((values.keys() - names.keys(), "has"), (names.keys() - values.keys(), "lacks")):
             if keys:
                 raise ValueError(f"{path} is no evaluation: it {verb} {', '.join(sorted(keys))}")
@@ -134,13 +138,14 @@ def make_report(
         consensus=summarize(rows, "consensus") if "consensus" in models else None,
         gce=summarize_gce(groups, models),
         collapse=detect_collapse(rows) if {"base", "adapted"} <= set(models) else None,
+        safety=summarize_safety(rows, groups, models) if reference == "depth" else None,
         by_surface={} if booster else _by_surface(rows, models, subject),
         per_scene=_per_scene(groups, rows, models, subject) if booster else {},
         counts=count_rows(rows, len(groups), subject),
         protocol=protocol.to_dict() | {"description": protocol.describe()},
         reference=reference,
         adapted=subject == "adapted",
-        unit="native units" if reference == "proxy" else "mm",
+        unit="native units" if reference == "proxy" else "cm" if protocol.unit == "cm" else "mm",
         groups=groups,
         rows=rows,
         dataset=dataset,
@@ -164,9 +169,10 @@ def mean(values: list[float]) -> float:
 
 
 def summarize(rows: list[dict], model: str) -> dict:
-    """{region: {metric: mean over images}} of one of `base`, `adapted`, `consensus`."""
+    """{region: {metric: mean over images}} of one of `base`, `adapted`, `consensus`, with the metrics of the rows."""
+    metrics = rows[0][model]["all"] if rows else METRICS
     return {
-        region: {metric: mean([row[model][region][metric] for row in rows]) for metric in METRICS}
+        region: {metric: mean([row[model][region][metric] for row in rows]) for metric in metrics}
         for region in REGIONS
     }
 
@@ -180,6 +186,19 @@ def summarize_gce(groups: list[dict], models: list[str]) -> dict:
             values = [group[f"gce_{model}{suffix}"] for group in counted] if model in models else None
             gce[model + suffix] = None if values is None else mean(values)
     return gce | {"num_groups": len(counted), "num_skipped": len(groups) - len(counted)}
+
+
+def summarize_safety(rows: list[dict], groups: list[dict], models: list[str]) -> dict | None:
+    """The safety figures of base and adapted; None where nothing is known: no true depth, or no target."""
+    result = {
+        model: {
+            "false_free_space": mean([row[model]["false_free_space"] for row in rows]),
+            "flicker": mean([group[f"flicker_{model}"] for group in groups]),
+        }
+        for model in ("base", "adapted")
+        if model in models
+    }
+    return None if all(math.isnan(value) for own in result.values() for value in own.values()) else result
 
 
 def detect_collapse(rows: list[dict]) -> dict:

@@ -6,7 +6,7 @@ pictures come one at a time, so that a scene of 12 megapixels takes the memory o
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from gift_peft.evaluation.booster_scenes import BoosterScene, GroundTruth
 from gift_peft.images import read_image
 from gift_peft.losses import require_finite
 from gift_peft.models.loading import DepthModel
+from gift_peft.rules import UNKNOWN
 
 SCENE_PIXELS = 2**20  # of a prediction kept for GCE and spread; a quarter of Booster's size has fewer
 
@@ -78,6 +79,9 @@ def gift_i_sample(
     Raises ValueError naming group and image for predictions that are not finite or not of the images' size.
     """
     group = row if isinstance(row, Group) else collate_group(row, model.processor, model.size)
+    if group.target is None and model.masks_itself and reference == "proxy":
+        known = model.predict_proxies(group.pixel_values) != UNKNOWN
+        group = replace(group, valid=known if group.valid is None else group.valid & known)
     maps = _predict(predictors, group.pixel_values, f"group {group.group_id}", group.names)
     for name, prediction in maps.items():
         if prediction.shape != group.mask.shape:
@@ -114,7 +118,7 @@ def _against_proxy(group: Group, model: DepthModel) -> list[tuple]:
     """Per observation the base's prediction on the treated reference, mask and valid mask, at the network's size."""
     target = group.reference_target
     if target is None and group.reference_pixel_values is not None:
-        target = model.predict_base(group.reference_pixel_values)[0]
+        target = model.predict_proxies(group.reference_pixel_values)[0]
         require_finite(target[None], f"group {group.group_id}: the frozen prediction", ["the treated reference"])
     return _on_network_grid(group, None if target is None else target.numpy())
 

@@ -44,20 +44,12 @@ class PredictionFolder:
         Raises FileNotFoundError listing those that are missing and, where the protocol `needs_scale` because it fits
         none, ValueError for PNGs without one.
         """
-        missing, pictures = [], []
-        for scene in scenes:
-            for image in scene.images:
-                path = self._find(scene, image)
-                if path is None:
-                    missing.append(f"{scene.name}/{CAMERA}/{image.stem}")
-                elif path.suffix == ".png":
-                    pictures.append(path)
-        if missing:
-            more = f" and {len(missing) - 20} more" if len(missing) > 20 else ""
-            raise FileNotFoundError(
-                f"predictions {self.folder}: {len(missing)} missing (as {', '.join(SUFFIXES)}): "
-                f"{', '.join(missing[:20])}{more}"
-            )
+        found = [
+            (f"{scene.name}/{CAMERA}/{image.stem}", self._find(scene, image))
+            for scene in scenes
+            for image in scene.images
+        ]
+        pictures = [path for path in require_stored(self.folder, found) if path.suffix == ".png"]
         if needs_scale and pictures and self.scale is None:
             raise ValueError(f"{pictures[0]}: the protocol fits no scale, so say what one count is: prediction_scale")
 
@@ -66,20 +58,44 @@ class PredictionFolder:
         path = self._find(scene, image)
         if path is None:
             raise FileNotFoundError(f"predictions {self.folder}: {scene.name}/{CAMERA}/{image.stem} is missing")
-        values = _read_picture(path) if path.suffix in (".png", ".pfm") else _read_array(path)
-        if values.ndim != 2 or not values.size or values.dtype.kind not in "fiu":
-            raise ValueError(f"{path}: {values.dtype} {values.shape}; a prediction is (h,w) numbers")
-        if values.dtype != np.float64:
-            values = values.astype(np.float32)
-        bad = np.count_nonzero(~np.isfinite(values))
-        if bad:
-            raise ValueError(f"{path}: the prediction has {bad} NaN or infinite values")
+        values = read_stored(path)
         return values if self.scale is None else values * self.scale
 
     def _find(self, scene: BoosterScene, image: Path) -> Path | None:
-        place = self.folder / scene.name / CAMERA
-        candidates = (place / f"{image.stem}{suffix}" for suffix in SUFFIXES)
-        return next((path for path in candidates if path.is_file()), None)
+        return find_stored(self.folder / scene.name / CAMERA, image.stem)
+
+
+def find_stored(place: Path, stem: str) -> Path | None:
+    """The stored prediction called `stem` in a folder, the first of `SUFFIXES`; None if there is none."""
+    candidates = (place / f"{stem}{suffix}" for suffix in SUFFIXES)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def require_stored(folder: Path, found: Iterable[tuple[str, Path | None]]) -> list[Path]:
+    """The files of (name, file) pairs; FileNotFoundError where there is no folder, or listing the names without."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"predictions {folder}: no such folder")
+    pairs = list(found)
+    missing = [name for name, path in pairs if path is None]
+    if missing:
+        more = f" and {len(missing) - 20} more" if len(missing) > 20 else ""
+        raise FileNotFoundError(
+            f"predictions {folder}: {len(missing)} missing (as {', '.join(SUFFIXES)}): {', '.join(missing[:20])}{more}"
+        )
+    return [path for _, path in pairs if path is not None]
+
+
+def read_stored(path: Path) -> np.ndarray:
+    """(h,w) float32 or float64 of a file; ValueError naming one that is no prediction, or that holds a NaN."""
+    values = _read_picture(path) if path.suffix in (".png", ".pfm") else _read_array(path)
+    if values.ndim != 2 or not values.size or values.dtype.kind not in "fiu":
+        raise ValueError(f"{path}: {values.dtype} {values.shape}; a prediction is (h,w) numbers")
+    if values.dtype != np.float64:
+        values = values.astype(np.float32)
+    bad = np.count_nonzero(~np.isfinite(values))
+    if bad:
+        raise ValueError(f"{path}: the prediction has {bad} NaN or infinite values")
+    return values
 
 
 def _read_array(path: Path) -> np.ndarray:

@@ -42,7 +42,7 @@ def describe(group: GroupPictures, proxies: torch.Tensor, found: SurfaceTarget, 
     for index, name in enumerate(group.names):
         base, target = proxies[index], targets[index]
         valid = group.valids[index] if len(group.valids) else np.ones(group.masks[index].shape, bool)
-        size = tuple(base.shape)
+        size = base.shape[0], base.shape[1]
         region = torch.from_numpy(resize_mask(group.masks[index], size) & resize_mask(valid, size))
         row: dict = {"image": name, "nearer": None, "moved": None}
         spread = _spread(base[torch.from_numpy(resize_mask(valid, size))])
@@ -55,8 +55,8 @@ def describe(group: GroupPictures, proxies: torch.Tensor, found: SurfaceTarget, 
             row["depth"] = _errors(base, target, reference, group.masks[index], valid, "depth", kind)
         if group.reference_proxy is not None:
             reference = np.asarray(group.reference_proxy)
-            inside = [resize_mask(mask, size) for mask in (group.masks[index], valid)]
-            row["proxy"] = _errors(base, target, reference, *inside, "proxy", kind)
+            mask, there = (resize_mask(each, size) for each in (group.masks[index], valid))
+            row["proxy"] = _errors(base, target, reference, mask, there, "proxy", kind)
         rows.append(row)
     fits = {name: [_known(value) for value in getattr(found, name)] for name in ("residual", "disagreement")}
     return {"surface": group.surface, "model": found.model, **fits, "observations": rows}
@@ -67,7 +67,7 @@ def _errors(
 ) -> list[float] | None:
     """[base, surface target]: RMSE inside the mask; None where nothing is known there."""
     protocol = replace(get_protocol(REFERENCES[against]), resolution=1.0)
-    score = Scorer(Observation("", {}, reference, mask, valid), Task([], protocol, kind, 1.0, ""))
+    score = Scorer(Observation("", {}, reference, mask, valid), Task([], protocol, kind, 1.0, "", in_mm=False))
     errors = [score(prediction)[0]["tom"]["rmse"] for prediction in (base, target)]
     return errors if all(map(math.isfinite, errors)) else None
 
@@ -103,7 +103,7 @@ def surface_lines(groups: Iterable[tuple[str, dict]]) -> list[str]:
 
 def _measured(groups: Sequence[tuple[str, dict]], against: str) -> str:
     """The mean error before and after, with a bootstrap interval over groups; empty if there is nothing to compare."""
-    rows = [
+    rows: list[dict] = [
         {"group_id": group_id, "image": row["image"]}
         | {model: {"tom": {"rmse": error}} for model, error in zip(("base", "adapted"), row[against], strict=True)}
         for group_id, told in groups

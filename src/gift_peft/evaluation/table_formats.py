@@ -23,6 +23,7 @@ LATEX = {
     "^": r"\textasciicircum{}",
     "↓": r"$\downarrow$",
     "↑": r"$\uparrow$",
+    **{f"δ{factor}": rf"$\delta_{{{factor}}}$" for factor in ("1.05", "1.10", "1.15", "1.20")},
     "δ1": r"$\delta_1$",
     "λc": r"$\lambda_c$",
     "λd": r"$\lambda_d$",

@@ -25,12 +25,15 @@ from gift_peft.evaluation.table_formats import (
 
 REGION_NAMES = {"tom": "ToM", "other": "Other", "all": "All"}
 METRIC_NAMES = {"mae": "MAE ↓", "abs_rel": "AbsRel ↓", "rmse": "RMSE ↓", "delta1": "δ1 % ↑"}
-HIGHER_IS_BETTER = {"delta1"}
 NO_TEACHING = (
     "The consensus (group median of the base inside the target) is no better than the base itself: "
     "these groups cannot teach accuracy."
 )
 INTERVALS = "In brackets: 95 % bootstrap intervals over groups (2,000 draws of whole groups, percentiles)."
+SAFETY = (
+    "False free space: target pixels reported more than 10 % and 200 mm behind the surface. Flicker: standard "
+    "deviation inside the target over a group, in mm."
+)
 BACKBONE_UNITS = "Proxies are each backbone's own: compare a backbone with its adapted form only."
 
 
@@ -43,7 +46,12 @@ def relative_change(base: float | None, adapted: float | None) -> float:
 
 def improved(metric: str, change: float) -> bool:
     """Whether a change of this metric is for the better."""
-    return change > 0 if metric in HIGHER_IS_BETTER else change < 0
+    return change > 0 if metric.startswith("delta") else change < 0
+
+
+def metric_heading(metric: str) -> str:
+    """What a metric is called in a table."""
+    return METRIC_NAMES.get(metric, f"δ{metric.removeprefix('delta_')} % ↑")
 
 
 def consensus_teaches(report: Report) -> bool | None:
@@ -63,15 +71,12 @@ def consensus_teaches(report: Report) -> bool | None:
 
 
 def report_tables(report: Report) -> list[Table]:
-    """Metrics per region, and what has one number per model (GCE; RMSE per surface kind), with the notes."""
-    rows: list[list[str | Cell] | None] = []
-    for region in REGIONS:
-        lines = _block(report, region)
-        rows += [[REGION_NAMES[region] if i == 0 else "", label, *cells] for i, (label, cells) in enumerate(lines)]
-        rows.append(None)
-    metrics = Table(_title(report), ["region", ""], [METRIC_NAMES[metric] for metric in METRICS], rows[:-1])
-    pairs = Table("", [""], ["base", "adapted", "change", "consensus"], _pairs(report), notes=notes(report))
-    return [metrics, pairs]
+    """Metrics per region (in two tables where the protocol asks for more deltas), and what has one number per model
+    (GCE; RMSE per surface kind), with the notes."""
+    more = [metric for metric in report.summary["all"] if metric not in METRICS]
+    tables = [_region_table(_title(report), report, METRICS)]
+    tables += [_region_table("", report, more)] if more else []
+    return [*tables, Table("", [""], ["base", "adapted", "change", "consensus"], _pairs(report), notes=notes(report))]
 
 
 def text_table(report: Report, color: bool = False) -> str:
@@ -98,6 +103,8 @@ def notes(report: Report) -> list[str]:
         lines.append(NO_TEACHING)
     if report.unit == "mm":
         lines.append(f"{report.gce_name} is in the model's own units, not in mm.")
+    if report.safety:
+        lines.append(SAFETY)
     return [*lines, protocol_note(report), skipped_note(report)]
 
 
@@ -123,17 +130,26 @@ def skipped_note(report: Report) -> str:
     )
 
 
-def _block(report: Report, region: str) -> list[tuple[str, list[Cell]]]:
+def _region_table(title: str, report: Report, metrics: Sequence[str]) -> Table:
+    rows: list[list[str | Cell] | None] = []
+    for region in REGIONS:
+        lines = _block(report, region, metrics)
+        rows += [[REGION_NAMES[region] if i == 0 else "", label, *cells] for i, (label, cells) in enumerate(lines)]
+        rows.append(None)
+    return Table(title, ["region", ""], [metric_heading(metric) for metric in metrics], rows[:-1])
+
+
+def _block(report: Report, region: str, metrics: Sequence[str]) -> list[tuple[str, list[Cell]]]:
     """The lines of one region."""
 
     def line(label: str, summary: dict) -> tuple[str, list[Cell]]:
-        return label, [value_cell(summary[region][metric]) for metric in METRICS]
+        return label, [value_cell(summary[region][metric]) for metric in metrics]
 
     lines = [line("base", report.base)] if report.base else []
     if report.adapted:
         lines.append(line("adapted", report.summary))
     if report.base and report.adapted:
-        lines.append(("change", [_change(report.base, report.summary, region, metric) for metric in METRICS]))
+        lines.append(("change", [_change(report.base, report.summary, region, metric) for metric in metrics]))
     if region == "tom" and report.consensus:
         lines.append(line("consensus", report.consensus))
     return lines
@@ -153,6 +169,9 @@ def _pairs(report: Report) -> list[list[str | Cell] | None]:
     gce, name = report.gce, report.gce_name
     pairs: list[list[str | Cell] | None] = [_pair(f"{name} ↓", gce["base"], gce["adapted"])]
     pairs.append(_pair(f"{name} normalised ↓", gce["base_normalized"], gce["adapted_normalized"]))
+    for label, name in (("False free space % ↓", "false_free_space"), ("Flicker mm ↓", "flicker")):
+        if report.safety:
+            pairs.append(_pair(label, *(report.safety.get(model, {}).get(name) for model in ("base", "adapted"))))
     for surface, entry in report.by_surface.items():
         models = (entry["base"], entry["summary"] if report.adapted else None, entry["consensus"])
         values = [model and model["tom"]["rmse"] for model in models]
@@ -168,9 +187,11 @@ def comparison_table(reports: Sequence[tuple[str, Report]], regions: Sequence[st
 
     Args:
         reports: (name, report) of one dataset under one protocol.
-        regions: those of the columns, four metrics each.
+        regions: those of the columns, four metrics each, and the one by which the protocol's benchmark ranks.
     """
-    columns = [(region, metric) for region in regions for metric in METRICS]
+    ranked = reports[0][1].protocol.get("ranked_by")  # (evaluations of 0.1.0 do not say)
+    metrics = [*METRICS, *([ranked] if ranked and ranked not in METRICS else [])]
+    columns = [(region, metric) for region in regions for metric in metrics]
     bases: dict[str, list[str | Cell]] = {}
     adapted: list[list[str | Cell] | None] = []
     for name, report in reports:
@@ -187,13 +208,13 @@ def comparison_table(reports: Sequence[tuple[str, Report]], regions: Sequence[st
     lines = list(dict.fromkeys(protocol_note(report) for _, report in reports))
     several = len(reports) > 1
     lines += [f"{name}: {skipped_note(report)}" if several else skipped_note(report) for name, report in reports]
-    if several and any(report.unit != "mm" for _, report in reports):
+    if several and any(report.reference == "proxy" for _, report in reports):
         lines.append(BACKBONE_UNITS)
-    spans = [(REGION_NAMES[region], len(METRICS)) for region in regions]
+    spans = [(REGION_NAMES[region], len(metrics)) for region in regions]
     return Table(
         _title(reports[0][1], with_counts=not several),
         ["model"],
-        [METRIC_NAMES[m] for _, m in columns],
+        [metric_heading(m) for _, m in columns],
         rows,
         spans,
         lines,
@@ -207,7 +228,7 @@ def uncertainty_table(report: Report) -> Table:
     bootstrap = GroupBootstrap(report.rows)
     rows: list[list[str | Cell] | None] = []
     for region in REGIONS:
-        for metric in METRICS:
+        for metric in report.summary[region]:
             cells = [
                 estimate_cell(value_cell(summaries[model][region][metric]), bootstrap.interval(model, region, metric))
                 for model in models
@@ -216,7 +237,7 @@ def uncertainty_table(report: Report) -> Table:
                 change = _change(report.base, report.summary, region, metric)
                 cells.append(estimate_cell(change, bootstrap.change_interval(region, metric)))
             cells += [value_cell(median_of(report.rows, model, region, metric)) for model in models]
-            rows.append([f"{REGION_NAMES[region]} {METRIC_NAMES[metric]}", *cells])
+            rows.append([f"{REGION_NAMES[region]} {metric_heading(metric)}", *cells])
         rows.append(None)
     rows.append(_gce_line(report, models))
     change = ["base to adapted"] if len(models) == 2 else []

@@ -1,4 +1,7 @@
-"""`gift-peft evaluate`: load, evaluate, print the table, leave the files."""
+"""`gift-peft evaluate`: load, evaluate, print the table, leave the files.
+
+One of four: groups of GIFT-I, Booster, LayeredDepth's first layer, MD-3k.
+"""
 
 import json
 from collections.abc import Sequence
@@ -10,7 +13,10 @@ from gift_peft.files import write_whole
 from gift_peft.options import OptionParser, add_adapter, add_base, add_dataset, use_color
 
 if TYPE_CHECKING:
+    from gift_peft.evaluation.orderings import OrderingReport
     from gift_peft.evaluation.results import Report
+
+DATASETS = ("dataset", "booster", "layereddepth", "md3k")  # options, of which one is given
 
 
 def run_evaluation(
@@ -92,16 +98,70 @@ def _check_place(folder: Path) -> None:
         known = json.loads(first if "metrics.json" in there else first.partition("\n")[0]).keys()
     except (OSError, ValueError, AttributeError):
         known = set()
-    if there and not (known >= {"protocol", "summary"} or known >= {"group_id", "image"}):
+    if there and not (known >= {"counts", "summary"} or known >= {"group_id", "image"}):
         raise ValueError(
             f"--out {folder}: its {', '.join(there)} is of no evaluation and is kept; name another folder"
         )
 
 
+def run_orderings(
+    name: str,
+    root: str | Path,
+    base: str | Path | None,
+    adapter: str | Path | None = None,
+    *,
+    predictions: str | Path | None = None,
+    out: str | Path = "evaluation",
+    adapter_scale: float | None = None,
+    size: str | tuple[int, int] | None = None,
+    kind: str | None = None,
+    revision: str | None = None,
+    device: str | None = None,
+    accept_base: bool = False,
+    color: bool = False,
+    **options: Any,
+) -> "OrderingReport":
+    """`gift-peft evaluate --layereddepth ROOT` and `--md3k ROOT`; arguments as in `run_evaluation`.
+
+    `name` is `layereddepth` or `md3k`; `options` are further arguments of its evaluator.
+    """
+    from gift_peft.evaluation.layered_depth import evaluate_layered_depth, find_layered_depth
+    from gift_peft.evaluation.md3k import evaluate_md3k, read_md3k
+    from gift_peft.evaluation.ordering_tables import ordering_markdown, ordering_text
+    from gift_peft.models.adapter_base import find_base
+    from gift_peft.models.loading import DepthModel
+
+    _check_place(Path(out))
+    evaluate = {"layereddepth": evaluate_layered_depth, "md3k": evaluate_md3k}[name]
+    if base is not None or adapter is not None:  # fail early: large weights take minutes to load
+        read_md3k(root) if name == "md3k" else find_layered_depth(root, options.get("partial", False))
+    if base is None and adapter is not None:
+        base, revision = find_base(None, adapter, revision)
+    model = (
+        None
+        if base is None
+        else DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
+    )
+    report = evaluate(root, model, predictions, kind if model is None else None, **options)
+    if model is not None:
+        report.about |= {
+            "base": str(base),
+            "revision": revision,
+            "adapter": adapter and str(adapter),
+            "adapter_scale": adapter_scale,
+            "size": list(model.size),
+        }
+    folder = report.save(out)
+    write_whole(folder / "report.md", ordering_markdown(report))
+    print(ordering_text(report, color=color))
+    print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
+    return report
+
+
 def make_parser() -> OptionParser:
     parser = OptionParser(
         "evaluate",
-        "Compare base and adapter on validation groups, or on Booster.",
+        "Compare base and adapter on validation groups, or on a public benchmark.",
         "gift-peft evaluate --base demo/base --adapter demo/adapter --dataset demo/gift-i",
     )
     add_base(parser, required=False)
@@ -118,11 +178,17 @@ def make_parser() -> OptionParser:
     )
     booster = parser.add_argument_group("Booster")
     booster.add_argument("--booster", metavar="ROOT", help="evaluate on Booster instead of GIFT-I")
-    booster.add_argument("--predictions", metavar="DIR", help="stored predictions in place of --base")
+    text = "stored predictions in place of --base (of any benchmark)"
+    booster.add_argument("--predictions", metavar="DIR", help=text)
     booster.add_argument("--resize", type=float, default=0.25, metavar="X", help="of the ground truth")
     booster.add_argument("--occlusion", choices=["all", "noc"], default="all", help="noc: what both cameras see")
     booster.add_argument("--subset", choices=["balanced", "unbalanced"], help="default: balanced, else what there is")
     booster.add_argument("--partial", action="store_true", help="an incomplete official set is wanted as it is")
+    orderings = parser.add_argument_group("which point is nearer, on glass")
+    orderings.add_argument("--layereddepth", metavar="ROOT", help="evaluate on LayeredDepth's first layer")
+    orderings.add_argument("--md3k", metavar="ROOT", help="evaluate the layer preference on MD-3k")
+    text = "the adapter's layer dial: also at these scales (default: -1 to 1 in quarters; 0 is the base)"
+    orderings.add_argument("--dial", nargs="*", type=float, metavar="S", help=text)
     return parser
 
 
@@ -132,12 +198,24 @@ def run(argv: Sequence[str]) -> int:
     if args.list_protocols:
         print(list_protocols())
         return 0
-    if (args.dataset is None) == (args.booster is None):
-        parser.error("one of --dataset and --booster is required")
+    named = [name for name in DATASETS if getattr(args, name) is not None]
+    if len(named) != 1:
+        parser.error("one of --dataset, --booster, --layereddepth and --md3k is required")
     if (args.base is None and args.adapter is None) == (args.predictions is None):
         parser.error("one of --base, --adapter and --predictions is required")
     if args.predictions and (args.dataset or args.adapter):
-        parser.error("--predictions go with --booster, and without --adapter")
+        parser.error("--predictions go with a benchmark, and without --adapter")
+    if args.dial is not None and (not args.adapter or named[0] not in ("layereddepth", "md3k")):
+        parser.error("--dial turns an --adapter on --md3k or --layereddepth")
+    names = ("adapter_scale", "size", "kind", "revision", "out", "predictions", "accept_base")
+    model = {name: getattr(args, name) for name in names}
+    if named[0] in ("layereddepth", "md3k"):
+        from gift_peft.evaluation.orderings import DIAL_SCALES
+
+        options = {"dial": args.dial or (DIAL_SCALES if args.dial is not None else ()), "color": use_color()}
+        options |= {"partial": args.partial} if args.layereddepth else {}
+        run_orderings(named[0], getattr(args, named[0]), args.base, args.adapter, **model, **options)
+        return 0
     options: dict[str, Any] = {"prediction_scale": args.prediction_scale, "color": use_color()}
     if args.booster:
         options |= {"resize": args.resize, "occlusion": args.occlusion, "subset": args.subset}
@@ -149,15 +227,9 @@ def run(argv: Sequence[str]) -> int:
         args.dataset,
         args.adapter,
         booster=args.booster,
-        predictions=args.predictions,
         split=args.split,
         dataset_revision=args.dataset_revision,
-        out=args.out,
-        adapter_scale=args.adapter_scale,
-        size=args.size,
-        kind=args.kind,
-        revision=args.revision,
-        accept_base=args.accept_base,
+        **model,
         **options,
     )
     return 0

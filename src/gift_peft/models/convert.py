@@ -1,4 +1,4 @@
-"""Official weights to a transformers folder (`gift-peft convert vggt|metric3d SRC DST`).
+"""Official weights to a transformers folder (`gift-peft convert vggt|metric3d|moge SRC DST`).
 
 The folder has config, safetensors, image processor and the model's own code, so that it also loads with
 `trust_remote_code=True`. It appears when it is complete, or not at all.
@@ -13,11 +13,14 @@ from transformers import PreTrainedConfig
 
 from gift_peft.files import check_replaceable, is_hub_id, whole_folder
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
+from gift_peft.models.moge import MogeConfig, MogeForDepthEstimation, MogeImageProcessorPil
+from gift_peft.models.moge.package_moge import import_moge
 from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil
 
-# What a hub id without a file means: facebook/VGGT-1B, JUGGHM/Metric3D.
+# What a hub id without a file means: facebook/VGGT-1B, JUGGHM/Metric3D, Ruicheng/moge-2-vitl-normal.
 VGGT_FILE = "model.safetensors"
 METRIC3D_FILE = "metric_depth_vit_giant2_800k.pth"
+MOGE_FILE = "model.pt"
 
 
 def convert_vggt(source: str | Path, folder: str | Path, config: VggtConfig | str | Path | None = None) -> Path:
@@ -47,7 +50,25 @@ def convert_metric3d(
     return _convert(Metric3DForDepthEstimation, Metric3DImageProcessorPil(), source, folder, config)
 
 
-CONVERTERS = {"vggt": convert_vggt, "metric3d": convert_metric3d}
+def convert_moge(
+    source: str | Path,
+    folder: str | Path,
+    config: MogeConfig | str | Path | None = None,
+    num_tokens: int | None = None,
+) -> Path:
+    """Write `folder` from official MoGe or MoGe-2 weights (`model.pt`), which state their sizes themselves.
+
+    As `convert_vggt`; `num_tokens` is what the model takes where a call gives none. Raises ValueError with the command
+    that installs it where the package of the network is missing.
+    """
+    check_replaceable(Path(folder))
+    import_moge("v2")  # before a download of a gigabyte
+    source = _fetch(source, MOGE_FILE, folder)
+    settings = {} if num_tokens is None else {"num_tokens": num_tokens}
+    return _convert(MogeForDepthEstimation, MogeImageProcessorPil(), source, folder, config, settings)
+
+
+CONVERTERS = {"vggt": convert_vggt, "metric3d": convert_metric3d, "moge": convert_moge}
 
 
 def _fetch(source: str | Path, default: str, folder: str | Path) -> Path:
@@ -77,11 +98,20 @@ def _read_config(config_class: type[PreTrainedConfig], path: str | Path) -> PreT
         raise ValueError(f"{path}: not the sizes of a model ({' '.join(str(error).split())})") from None
 
 
-def _convert(model_class: type[Any], processor: Any, source: Path, folder: str | Path, config: Any) -> Path:
+def _convert(
+    model_class: type[Any],
+    processor: Any,
+    source: Path,
+    folder: str | Path,
+    config: Any,
+    settings: dict[str, Any] | None = None,
+) -> Path:
     folder = Path(folder)
     if config is not None and not isinstance(config, PreTrainedConfig):
         config = _read_config(model_class.config_class, config)
     model = model_class.from_official(source, config)
+    for name, value in (settings or {}).items():
+        setattr(model.config, name, value)
     try:
         with whole_folder(folder) as temporary:
             model.save_pretrained(temporary)

@@ -2,7 +2,7 @@
 
 Thin: the package (depth-anything-3, or MoGe as dlr-moge) is imported when such a base is asked for, and its network is
 called as a transformers depth model is: `pixel_values` (B,3,H,W) in, `.predicted_depth` (B,H,W) out, in float32. They
-cannot carry a GIFT adapter.
+cannot carry a GIFT adapter; MoGe converted by `gift-peft convert moge` can.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from transformers import DPTImageProcessorPil
 from transformers.modeling_outputs import DepthEstimatorOutput
 
 from gift_peft.files import reason
+from gift_peft.models.moge.package_moge import INSTALL
 
 SIZE = (476, 644)  # of the paper's backbones; a multiple of the patches of both
 PATCH = 14
@@ -112,7 +113,7 @@ def _predict_moge(network: Any, pixel_values: torch.Tensor) -> torch.Tensor:
 _LOADERS = {"da3": _load_da3, "moge": _load_moge}
 _INSTALL = {
     "da3": "`pip install depth-anything-3` (which asks for numpy<2: an environment of its own, and --predictions)",
-    "moge": "`pip install dlr-moge`",
+    "moge": f"`{INSTALL}`",
 }
 
 

@@ -103,7 +103,7 @@ def _config_file(base: str | Path, revision: str | None) -> Path:
 
     check_base_name(base)
     try:
-        return Path(cached_file(str(base), "config.json", revision=revision))
+        return Path(str(cached_file(str(base), "config.json", revision=revision)))
     except OSError as error:
         raise FileNotFoundError(f"base model {base}: {reason(error)}") from None
 
@@ -144,7 +144,7 @@ def _digest_tensors(stats: tuple[tuple[str, int, int], ...], base: str) -> tuple
             tensor = _tensor(Path(path), name)
             tensor = tensor.float() if tensor.is_floating_point() else tensor
             layout.update(f"{name} {tuple(tensor.shape)}\n".encode())
-            values.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy())
+            values.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
     except pickle.UnpicklingError:
         raise ValueError(
             f"base model {base}: its weights are a pickle that would run code; take safetensors"

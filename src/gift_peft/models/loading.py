@@ -22,11 +22,11 @@ from PIL import Image
 from torch import nn
 
 from gift_peft.files import reason, unfetched
-from gift_peft.images import read_image
+from gift_peft.images import given_picture
 from gift_peft.models.adapter_base import check_base, find_base
 from gift_peft.models.identity import adapter_as_base, check_base_name
 from gift_peft.models.pixels import resolve_size, to_pixel_values
-from gift_peft.rules import KINDS
+from gift_peft.rules import KINDS, UNKNOWN
 
 # Depth Pro's post-processing turns inverse depth into depth, and ZoeDepth's needs torchvision: native units are kept.
 RESIZED_HERE = {"zoedepth", "depth_pro"}
@@ -125,15 +125,15 @@ class DepthModel:
 
         if adapter is None and adapter_scale is not None:
             raise ValueError("adapter_scale needs an adapter")
-        if base is None and adapter is None:
+        if adapter is not None and not (base is not None and split_external(base)):
+            base, revision = find_base(base, adapter, revision)
+        if base is None:
             raise ValueError("a base model or an adapter is needed")
-        if base is not None and split_external(base):
+        if split_external(base):
             if adapter is not None:
                 raise ValueError(f"base {base}: an adapter needs a model of transformers")
             network, processor = load_external(base)
         else:
-            if adapter is not None:
-                base, revision = find_base(base, adapter, revision)
             network, processor = load_base(base, revision, with_processor=not _brings_processor(adapter))
         if adapter is None and Path(base).is_dir():  # a merged model says at what size it was trained
             merged = read_gift(base)
@@ -172,6 +172,11 @@ class DepthModel:
             raise ValueError("the model does not say where it came from; pass its processor=")
         return load_processor(source)
 
+    @property
+    def masks_itself(self) -> bool:
+        """Whether the network says where there is no surface."""
+        return getattr(getattr(self.network, "config", None), "predicts_valid_mask", False)
+
     def known_kind(self) -> str:
         """`kind`; ValueError where nothing says it."""
         if self.kind is None:
@@ -192,6 +197,13 @@ class DepthModel:
     def predict_base(self, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
         """`predict` of the base alone: with the adapter off, or by the teacher."""
         return self._predict(pixel_values, batch_size, base=True)
+
+    def predict_proxies(self, pixel_values: torch.Tensor, batch_size: int = 2) -> torch.Tensor:
+        """`predict_base`, with `rules.UNKNOWN` where the network's own mask says that there is no surface (sky).
+
+        For a network without such a mask (an output `valid_mask`) the same as `predict_base`.
+        """
+        return self._predict(pixel_values, batch_size, base=True, masked=True)
 
     def depth_at(
         self,
@@ -217,34 +229,46 @@ class DepthModel:
             FileNotFoundError: no such file.
             ValueError: no picture, NaN or infinity in the prediction, a focal length that the processor does not take.
         """
-        name = str(image) if isinstance(image, str | Path) else "the picture"
-        if isinstance(image, np.ndarray):
-            if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2 or not image.size:
-                raise ValueError(f"{name}: (H,W,3) uint8 is expected, not {image.shape} {image.dtype}")
-            image = Image.fromarray(image)
-        elif not isinstance(image, str | Path | Image.Image):
-            raise ValueError(f"{name}: a path, a PIL picture or a uint8 array is expected, not {type(image).__name__}")
-        picture = read_image(image, name)
+        picture, name = given_picture(image)
+        return self.depths_of(self.inputs([picture]), [(picture.height, picture.width)], [name], focal_length, base)[0]
+
+    def depths_of(
+        self,
+        pixel_values: torch.Tensor,
+        sizes: Sequence[tuple[int, int]],
+        names: Sequence[str],
+        focal_length: float | tuple[float, float] | None = None,
+        base: bool = False,
+    ) -> list[np.ndarray]:
+        """`depth_at` of several pictures in one forward: `inputs` of them, their (height, width), and what to call
+        them in messages."""
         post_process, options = self.processor.post_process_depth_estimation, {}
         if focal_length is not None:
             if "focal_lengths" not in inspect.signature(post_process).parameters:
                 raise ValueError(f"focal_length: {type(self.processor).__name__} takes none")
-            options["focal_lengths"] = [focal_length]
-        output = self._forward(self.inputs([picture]), base)
+            options["focal_lengths"] = [focal_length] * len(sizes)
+        output = self._forward(pixel_values, base)
         if isinstance(output, torch.Tensor):
             output = SimpleNamespace(predicted_depth=output)
-        if not torch.isfinite(output.predicted_depth).all():
-            raise ValueError(f"{name}: the prediction has NaN or infinite values")
-        size = picture.height, picture.width
+        for name, depth in zip(names, output.predicted_depth, strict=True):
+            if not torch.isfinite(depth).all():
+                raise ValueError(f"{name}: the prediction has NaN or infinite values")
         if getattr(getattr(self.network, "config", None), "model_type", None) in RESIZED_HERE:
-            depth = nn.functional.interpolate(output.predicted_depth[None], size, mode="bicubic")
+            pairs = zip(output.predicted_depth[:, None, None], sizes, strict=True)
+            depths = [nn.functional.interpolate(own, tuple(size), mode="bicubic") for own, size in pairs]
         else:
-            depth = post_process(output, target_sizes=[size], **options)[0]["predicted_depth"]
-        return depth.float().cpu().numpy().reshape(size)  # transformers squeezes a side of one pixel away
+            depths = [own["predicted_depth"] for own in post_process(output, target_sizes=list(sizes), **options)]
+        # transformers squeezes a side of one pixel away
+        return [depth.float().cpu().numpy().reshape(size) for depth, size in zip(depths, sizes, strict=True)]
 
-    def _predict(self, pixel_values: torch.Tensor, batch_size: int, base: bool) -> torch.Tensor:
-        outputs = (self._forward(batch, base) for batch in pixel_values.split(batch_size))
-        return torch.cat([getattr(output, "predicted_depth", output).float().cpu() for output in outputs])
+    def _predict(self, pixel_values: torch.Tensor, batch_size: int, base: bool, masked: bool = False) -> torch.Tensor:
+        depths = []
+        for batch in pixel_values.split(batch_size):
+            output = self._forward(batch, base)
+            depth = getattr(output, "predicted_depth", output).float()
+            valid = getattr(output, "valid_mask", None) if masked else None
+            depths.append((depth if valid is None else depth.masked_fill(~valid, UNKNOWN)).cpu())
+        return torch.cat(depths)
 
     def _forward(self, pixel_values: torch.Tensor, base: bool) -> Any:
         if base and self._teacher is not None:

@@ -101,7 +101,7 @@ def _draw(plots: list[tuple[str, list[Curve]]], title: str, paths: Sequence[Path
     if not plots:
         return []
     names = list(dict.fromkeys(name for _, curves in plots for name, _, _ in curves))
-    pyplot = _import_pyplot()
+    pyplot = import_pyplot()
     figure, axes = pyplot.subplots(
         1, len(plots), figsize=(max(5.6, 4.6 * len(plots)), 4.2), squeeze=False, layout="constrained"
     )
@@ -136,7 +136,7 @@ def _draw(plots: list[tuple[str, list[Curve]]], title: str, paths: Sequence[Path
     return names
 
 
-def _import_pyplot() -> Any:
+def import_pyplot() -> Any:
     """matplotlib.pyplot without a display; ImportError with the line that installs it."""
     try:
         import matplotlib

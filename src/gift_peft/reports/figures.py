@@ -18,14 +18,14 @@ from PIL import Image, ImageDraw, ImageFont
 from gift_peft.colormap import color_range, colorize, colorize_error
 from gift_peft.evaluation.alignment import align, known
 from gift_peft.evaluation.metrics import depth_metrics
-from gift_peft.evaluation.protocols import get_protocol
+from gift_peft.evaluation.protocols import MILLIMETERS, get_protocol
 from gift_peft.files import write_whole
 from gift_peft.images import jpeg_uri
 
 TILE_WIDTH, GAP, HEADER, CAPTION, LEGEND = 512, 12, 54, 48, 46  # pixels
 TITLE, TEXT = 37, 29  # sizes of type in pixels: 9 and 7 points in print
 BAR_WIDTH, BAR_HEIGHT = 420, 22  # of the color bar
-MILLIMETERS, NATIVE = "mm", "(the model's units)"
+NATIVE = "(the model's units)"
 # How Pillow saves it. No dates in a PDF: the same panels give the same bytes.
 FORMATS = {
     ".png": {"optimize": True, "dpi": (300, 300)},
@@ -65,7 +65,7 @@ class Aligned:
 
     Args:
         errors (`tuple[float, float]`): RMSE inside the target, base and adapted; NaN where nothing is known there.
-        unit (`str`): MILLIMETERS or NATIVE.
+        unit (`str`): that of the protocol, `mm` or `cm`; NATIVE for native units.
         kind (`str`): of all three maps, for the colours.
     """
 
@@ -102,14 +102,13 @@ class ColorBar:
 def align_panel(panel: Panel) -> Aligned:
     """Both predictions aligned as the protocol says; ValueError if the arrays differ in size."""
     valid = np.ones(panel.reference.shape, bool) if panel.valid is None else panel.valid
-    base, adapted = (
-        align(prediction, panel.reference, valid, panel.protocol, panel.kind).aligned
-        for prediction in (panel.base, panel.adapted)
-    )
-    reference = np.where(valid & known(panel.reference), panel.reference, np.nan)
-    errors = tuple(depth_metrics(d, panel.reference, panel.target & valid)["rmse"] for d in (base, adapted))
-    native = get_protocol(panel.protocol).space == "native"
-    unit, kind = (NATIVE, panel.kind) if native else (MILLIMETERS, "depth")
+    rules = get_protocol(panel.protocol)
+    truth, base, adapted = (depth / MILLIMETERS[rules.unit] for depth in (panel.reference, panel.base, panel.adapted))
+    base, adapted = (align(depth, truth, valid, rules, panel.kind).aligned for depth in (base, adapted))
+    reference = np.where(valid & known(truth), truth, np.nan)
+    errors = tuple(depth_metrics(d, truth, panel.target & valid)["rmse"] for d in (base, adapted))
+    native = rules.space == "native"
+    unit, kind = (NATIVE, panel.kind) if native else (rules.unit, "depth")
     return Aligned(reference, base, adapted, errors, unit, kind)
 
 
@@ -191,16 +190,16 @@ def _bar(low: float, high: float, kind: str, unit: str) -> ColorBar:
 
 
 def _in_units(value: float, unit: str) -> str:
-    """Whole millimeters; three digits of the model's own units, never with an exponent."""
-    if unit == MILLIMETERS:
-        return f"{value:,.0f} mm"
+    """Millimeters, as whole numbers, or centimeters; three digits of the model's own units, never with an exponent."""
+    if unit != NATIVE:
+        return f"{value:,.{1 if unit == 'cm' else 0}f} {unit}"
     digits = 0 if value == 0 else math.floor(math.log10(abs(value)))
     return f"{value:,.{min(max(2 - digits, 0), 6)}f}"
 
 
 def _unit(unit: str) -> str:
-    """What follows the last of several numbers: millimeters stand behind each, the model's units once."""
-    return "" if unit == MILLIMETERS else f" {unit}"
+    """What follows the last of several numbers: a length's unit stands behind each, the model's units once."""
+    return f" {unit}" if unit == NATIVE else ""
 
 
 # ---- drawing ----

@@ -51,7 +51,7 @@ DEFAULTS = {
 
 @dataclass(frozen=True)
 class Backbone:
-    """What `backbones/*.md` tells of one of the paper's backbones: facts in the front matter, then prose.
+    """What `backbones/*.md` tells of a backbone: facts in the front matter, then prose.
 
     Args:
         title (`str`): name in headings.
@@ -65,7 +65,7 @@ class Backbone:
         head_parameters (`int`): what `head="full"` trains.
         targets (`str`): where LoRA goes, for the recipe.
         head (`str`): what is trained in full.
-        paper (`dict`): {row title: RMSE of the base, and with GIFT}, the paper's figures.
+        paper (`dict`): {row title: RMSE of the base, and with GIFT if it was adapted}, the paper's figures.
         text (`str`): Markdown about origin, license, input and output.
         folder (`str`, *optional*): what the examples call the converted weights.
         precision (`str`): what of it is exempt from autocast.
@@ -88,6 +88,11 @@ class Backbone:
     folder: str | None = None
     precision: str = ""
 
+    @property
+    def adapted_in_paper(self) -> bool:
+        """Whether the paper has a row of it with GIFT."""
+        return all(len(values) == 2 for values in self.paper.values())
+
     def adapter_sizes(self, rank: int) -> dict[str, tuple[int, int]]:
         """{head: (LoRA parameters, others)} that `get_gift_model` trains."""
         encoder, head = rank * self.encoder_lora, rank * self.head_lora
@@ -96,7 +101,7 @@ class Backbone:
 
 @functools.cache
 def backbones() -> tuple[Backbone, ...]:
-    """The paper's three backbones."""
+    """The paper's three backbones, and its strongest unadapted one."""
     from huggingface_hub import RepoCard
 
     found = []

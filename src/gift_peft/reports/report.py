@@ -5,34 +5,30 @@ matplotlib: if one of them is missing, the report says so and has the rest.
 """
 
 import filecmp
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from tqdm import tqdm
-
 from gift_peft.adapters.folder import ADAPTER_WEIGHTS
+from gift_peft.evaluation.ordering_tables import TITLES, ordering_tables
 from gift_peft.evaluation.results import Report
-from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
 from gift_peft.evaluation.tables import comparison_table, group_table, protocol_note, uncertainty_table
 from gift_peft.files import check_inputs_stay, check_own_file, reason, write_whole
 from gift_peft.images import list_images
-from gift_peft.models.loading import DepthModel
 from gift_peft.reports.ablation import ablation_table, is_ablation
+from gift_peft.reports.chosen import chosen_panels, notable_observations
 from gift_peft.reports.compare import write_compare
 from gift_peft.reports.curves import draw_dynamics, draw_retention
+from gift_peft.reports.dial_curve import draw_dial
 from gift_peft.reports.figures import Panel, before_after, error_maps
 from gift_peft.reports.model_card import MARK, model_card
 from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_names
 from gift_peft.reports.zero_shot import checkpoint_folders, draw_zero_shot
-from gift_peft.rules import GroupPictures
 
 HEAD = "# GIFT: "  # a report.md of ours begins so
 WRITTEN = ("report.md", "tables/*", "*.png", "*.pdf", "compare*.html", "model_card.md")
-COMPARED_GROUPS = 40  # in compare.html, one observation each: a browser has to open it
 HEADINGS = {
     "gift-i-proxy": "GIFT-I, against the treated reference",
     "gift-i-depth": "GIFT-I, against true depth",
@@ -131,6 +127,7 @@ def run_report(
     for run in saved:
         _evaluate_if_missing(run, output, device)
     _tables(saved, names, output)
+    _orderings(saved, names, output)
     _curves(saved, names, output)
     for run, name, own in zip(saved, names, folder_names(saved), strict=True):
         if panels:
@@ -176,7 +173,7 @@ def _is_of_adapter(run: SavedRun, report: Report) -> bool:
 
 
 def _evaluate_if_missing(run: SavedRun, output: Output, device: str | None) -> None:
-    if run.evaluations or run.adapter is None:
+    if run.evaluations or run.orderings or run.adapter is None:
         return
     from gift_peft.evaluation.verb import run_evaluation
 
@@ -235,6 +232,24 @@ def _scaled(name: str, report: Report) -> str:
     return name if scale in (None, 1) else f"{name} (adapter scale {scale:g})"
 
 
+def _orderings(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> None:
+    """LayeredDepth and MD-3k of each run, with the layer dial's curve where it was turned."""
+    for run, name, own in zip(runs, names, folder_names(runs), strict=True):
+        for folder, report in run.orderings.items():
+            stem = f"{folder}-{own}" if len(runs) > 1 else folder
+            output.sections.append(f"## {TITLES[report.dataset]}: {name}\n")
+            for table, suffix in zip(ordering_tables(report), ("", "-dial"), strict=False):
+                output.table(f"{stem}{suffix}", table, show=True)
+            if not report.dial:
+                continue
+            try:
+                draw_dial(report, [output.folder / f"{stem}-dial{suffix}" for suffix in (".png", ".pdf")])
+            except ImportError as error:
+                output.remark(f"{stem}-dial.png: {reason(error)}")
+                continue
+            output.sections.append(f"![layer dial]({stem}-dial.png)\n")
+
+
 # ---- curves ----
 
 
@@ -270,7 +285,7 @@ def _pictures(run: SavedRun, name: str, output: Output, count: int, device: str 
         kept: dict[tuple[str, str], Panel] = {}
         title = f"{name}: before and after, {HEADINGS[dataset]}"
         try:
-            stream = _panels(run, report, notable, kept, device)
+            stream = chosen_panels(run, report, notable, kept, device)
             write_compare(
                 stream,
                 output.folder / f"compare{stem}.html",
@@ -286,101 +301,6 @@ def _pictures(run: SavedRun, name: str, output: Output, count: int, device: str 
         columns = ("RGB", reference, "base", "GIFT")
         output.figure(f"before-after{stem}", title, partial(before_after, rows, columns=columns))
         output.figure(f"errors{stem}", f"{title}: errors", partial(error_maps, rows))
-
-
-def notable_observations(report: Report, count: int) -> dict[tuple[str, str], str]:
-    """{(group, image): why} of at most `count` observations, each of another group, chosen by rule and not by hand.
-
-    In turn: the largest RMSE of the base inside the target, the largest improvement, the largest deterioration.
-    """
-    scored = []
-    for row in report.rows:
-        base, adapted = (value_of(row, model, "tom", "rmse") for model in ("base", "adapted"))
-        if not row["skipped"] and not math.isnan(base) and not math.isnan(adapted):
-            scored.append((row["group_id"], row["image"], base, adapted))
-    rankings = {
-        "largest error of the base": sorted(scored, key=lambda entry: (-entry[2], entry[:2])),
-        "largest improvement": sorted((e for e in scored if e[3] < e[2]), key=lambda e: (e[3] - e[2], e[:2])),
-        "largest deterioration": sorted((e for e in scored if e[3] > e[2]), key=lambda e: (e[2] - e[3], e[:2])),
-    }
-    chosen: dict[tuple[str, str], str] = {}
-    groups: set[str] = set()
-    while len(chosen) < count and any(rankings.values()):
-        for why, ranking in rankings.items():
-            while ranking and ranking[0][0] in groups:
-                ranking.pop(0)
-            if ranking and len(chosen) < count:
-                group, image, *_ = ranking.pop(0)
-                chosen[group, image] = why
-                groups.add(group)
-    return chosen
-
-
-def _panels(
-    run: SavedRun, report: Report, notable: dict, kept: dict[tuple[str, str], Panel], device: str | None
-) -> Iterator[Panel]:
-    """Panels group by group, so that one group is in memory at a time; the notable ones are also put into `kept`."""
-    about = report.about
-    base = about.get("base") or run.arguments.get("model_name_or_path")
-    choices = (about.get(name) for name in ("adapter_scale", "revision", "size", "kind"))
-    model = DepthModel.from_pretrained(base, about["adapter"], *choices, device)
-    wanted = _wanted(report, notable)
-    if not wanted:
-        raise ValueError("no image has a known target to compare")
-    groups = None if report.dataset == "booster" else _group_rows(report)
-    for group_id, images in tqdm(wanted.items(), desc="pictures", unit="group", disable=None):
-        labels = {image: _label(group_id, image, notable) for image in images}
-        for image, panel in zip(images, _group_panels(report, groups, group_id, labels, model), strict=True):
-            if (group_id, image) in notable:
-                kept[group_id, image] = panel
-            yield panel
-
-
-def _wanted(report: Report, notable: dict) -> dict[str, list[str]]:
-    """{group: images}: the notable images, and of the groups with the largest errors the image with the largest."""
-    worst: dict[str, tuple[float, str]] = {}
-    for row in report.rows:
-        error = value_of(row, "base", "tom", "rmse")
-        if not row["skipped"] and not math.isnan(error) and error > worst.get(row["group_id"], (-1.0, ""))[0]:
-            worst[row["group_id"]] = error, row["image"]
-    largest = set(sorted(worst, key=lambda group: (-worst[group][0], group))[:COMPARED_GROUPS])
-    largest |= {group for group, _ in notable}
-    return {
-        group: list(dict.fromkeys([*(image for own, image in notable if own == group), worst[group][1]]))
-        for group in worst
-        if group in largest
-    }
-
-
-def _label(group_id: str, image: str, notable: dict) -> str:
-    why = notable.get((group_id, image))
-    return f"{group_id}/{image}" + (f", {why}" if why else "")
-
-
-def _group_rows(report: Report) -> Callable[[str], GroupPictures]:
-    """From a group's id to the group, as it is in the dataset."""
-    from gift_peft.dataset.gift_i import load_gift_i
-    from gift_peft.dataset.rows import parsed
-
-    about = report.about
-    split = about.get("split") or "validation"
-    rows = parsed(load_gift_i(about["dataset"], split, dataset_revision=about.get("dataset_revision")))
-    index = {group_id: number for number, group_id in enumerate(rows.select_columns(["group_id"])["group_id"])}
-
-    def find(group_id: str) -> GroupPictures:
-        if group_id not in index:
-            raise ValueError(f"{about['dataset']} no longer has group {group_id}")
-        return rows[index[group_id]]
-
-    return find
-
-
-def _group_panels(report, find, group_id: str, labels: dict[str, str], model: DepthModel) -> list[Panel]:
-    from gift_peft.reports.panels import group_panels, scene_panels
-
-    if report.dataset == "booster":
-        return scene_panels(report.about, group_id, labels, model, report.protocol["name"])
-    return group_panels(find(group_id), labels, model, report.protocol["name"], report.reference)
 
 
 def _zero_shot(

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gift_peft.evaluation.ordering_tables import TITLES
+from gift_peft.evaluation.orderings import OrderingReport
 from gift_peft.evaluation.results import Report
 from gift_peft.files import locate, portable_name, read_yaml
 
@@ -22,6 +24,7 @@ class SavedRun:
         history (`list[dict]`): the rows of metrics.jsonl; empty before the base was measured.
         record (`dict`, *optional*): adapter/gift.json; None before an adapter was written.
         evaluations (`dict[str, Report]`): saved ones, by the name of their folder.
+        orderings (`dict[str, OrderingReport]`): likewise those on LayeredDepth and MD-3k.
     """
 
     path: Path
@@ -29,6 +32,7 @@ class SavedRun:
     history: list[dict] = field(default_factory=list)
     record: dict | None = None
     evaluations: dict[str, Report] = field(default_factory=dict)
+    orderings: dict[str, OrderingReport] = field(default_factory=dict)
 
     @property
     def adapter(self) -> Path | None:
@@ -65,7 +69,7 @@ def read_run(path: str | Path) -> SavedRun:
     if path.suffix in (".yaml", ".yml") and path.is_file():
         return SavedRun(path, read_yaml(path))
     if (path / "metrics.json").is_file():
-        return SavedRun(path, evaluations={path.name: Report.load(path)})
+        return _with_evaluations(SavedRun(path), [path])
     if not ((path / "config.yaml").is_file() or (path / "metrics.jsonl").is_file()):
         raise FileNotFoundError(
             f"{path}: neither a run (config.yaml, metrics.jsonl), an evaluation (metrics.json) nor a YAML file of one"
@@ -78,10 +82,24 @@ def read_run(path: str | Path) -> SavedRun:
     record = path / "adapter" / "gift.json"
     if record.is_file():
         run.record = _json(record, record.read_text(encoding="utf-8"))
-    for folder in sorted(child for child in path.iterdir() if (child / "metrics.json").is_file()):
-        run.evaluations[folder.name] = Report.load(folder)
-    for names in (run.arguments, *(report.about for report in run.evaluations.values())):
+    _with_evaluations(run, sorted(child for child in path.iterdir() if (child / "metrics.json").is_file()))
+    for names in (run.arguments, *(report.about for report in (*run.evaluations.values(), *run.orderings.values()))):
         _find_again(names, path)
+    return run
+
+
+def _with_evaluations(run: SavedRun, folders: Sequence[Path]) -> SavedRun:
+    """The run with the evaluations saved in these folders, of either sort."""
+    for folder in folders:
+        path = folder / "metrics.json"
+        values = _json(path, path.read_text(encoding="utf-8"))
+        if isinstance(values, dict) and values.get("dataset") in TITLES:
+            try:
+                run.orderings[folder.name] = OrderingReport.from_dict(values)
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from None
+        else:
+            run.evaluations[folder.name] = Report.load(folder)
     return run
 
 
@@ -126,7 +144,7 @@ def ratio(run: SavedRun) -> str:
 
 def _base_name(run: SavedRun) -> str:
     name = run.arguments.get("model_name_or_path")
-    for report in run.evaluations.values():
+    for report in [*run.evaluations.values(), *run.orderings.values()]:
         name = name or report.about.get("base") or report.about.get("predictions")
     return portable_name(str(name)) if name else run.path.resolve().name
 

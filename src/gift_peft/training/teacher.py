@@ -41,7 +41,7 @@ from gift_peft.evaluation.surface_check import describe, surface_lines
 from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import pixel_settings, resize_mask
-from gift_peft.rules import GroupPictures
+from gift_peft.rules import UNKNOWN, GroupPictures
 from gift_peft.surface_targets import SurfaceTarget, paint_fills, surface_target
 
 if TYPE_CHECKING:
@@ -163,10 +163,10 @@ def _is_current(path: Path, expected: dict, command: str, what: str, names: Sequ
 def _predict_row(model: DepthModel, row: GroupPictures, batch_size: int):
     """(proxies (N, h, w), reference (h, w) or None) of one row; ValueError naming the image of a bad prediction."""
     names, images = row.names, row.images
-    proxies = model.predict(model.inputs(images), batch_size)
+    proxies = model.predict_proxies(model.inputs(images), batch_size)
     reference = None
     if row.reference is not None:
-        reference = model.predict(model.inputs([row.reference]))[0]
+        reference = model.predict_proxies(model.inputs([row.reference]))[0]
     for name, proxy in [*zip(names, proxies, strict=True), ("the reference", reference)]:
         if proxy is not None and tuple(proxy.shape) != model.size:
             raise ValueError(f"the model predicts {tuple(proxy.shape)} for images of {model.size}; they must be equal")
@@ -190,6 +190,10 @@ def _surface_row(
     """
     masks = np.stack([resize_mask(mask, model.size) for mask in row.masks])
     valids = np.stack([resize_mask(valid, model.size) for valid in row.valids]) if row.valids else None
+    if (unknown := (proxies == UNKNOWN).numpy()).any():  # what the teacher itself leaves out says nothing
+        valids = ~unknown if valids is None else valids & ~unknown
+        farthest = proxies.max() if not unknown.all() else proxies.new_ones(())
+        proxies = torch.where(proxies == UNKNOWN, farthest, proxies)
     flipped = model.predict(model.inputs(row.images).flip(-1), batch_size)
     if not (masks if valids is None else masks & valids).any():
         return proxies, flipped, {}

@@ -1,0 +1,132 @@
+"""MoGe through GIFT: what its own mask leaves out counts nowhere; trained on the embedded groups."""
+
+import json
+import sys
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.moge import tiny_moge, tiny_vit
+from helpers.runs import arguments
+from helpers.tiny import write_raw_tree
+from peft import PeftModel
+from transformers import AutoModelForDepthEstimation
+
+from gift_peft import evaluate_gift_i, gift_loss, load_gift_i
+from gift_peft.dataset.tensors import collate_group
+from gift_peft.models.loading import DepthModel
+from gift_peft.models.moge import MogeImageProcessorPil
+from gift_peft.models.moge.package_moge import INSTALL
+from gift_peft.rules import UNKNOWN
+from gift_peft.training import train
+from gift_peft.training.teacher import make_proxies
+
+__all__ = ["tiny_vit"]  # a fixture
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning"),
+    pytest.mark.filterwarnings("ignore:the base is the local folder"),
+]
+SIZE = (28, 56)
+EMBEDDED = Path(__file__).parents[2] / "src" / "gift_peft" / "demo" / "gift-i"
+
+
+def write_base(folder: Path, sky: bool = False) -> Path:
+    tiny_moge(sky=sky).save_pretrained(folder)
+    MogeImageProcessorPil().save_pretrained(folder)
+    return folder
+
+
+def test_what_the_mask_leaves_out_enters_neither_loss_nor_metrics(tiny_vit, tmp_path):
+    base, tree = write_base(tmp_path / "base", sky=True), write_raw_tree(tmp_path / "raw")
+    make_proxies(base, tree, size=SIZE, proxies_dir=tmp_path / "proxies")
+    rows = load_gift_i(tree, "train", teacher=base, proxies_dir=tmp_path / "proxies")
+    model = DepthModel.from_pretrained(base, size=SIZE)
+    group = collate_group(rows[0], model.processor, SIZE)
+    with torch.no_grad():
+        output = model.network(group.pixel_values)
+    assert 0.1 < output.valid_mask.float().mean() < 0.9
+    assert torch.equal(group.valid, output.valid_mask) and (group.target[~group.valid] == 0).all()
+    stored = torch.as_tensor(np.asarray(rows[0]["proxies"]))
+    assert torch.equal(stored == UNKNOWN, ~output.valid_mask)
+    assert torch.equal(stored[output.valid_mask], output.predicted_depth[output.valid_mask])
+    depth = output.predicted_depth + 0.01 * group.pixel_values.mean(1)
+    other = torch.where(output.valid_mask, depth, 1000 * depth)
+    losses = [gift_loss(each, group.target, group.mask, valid=group.valid).total for each in (depth, other)]
+    assert losses[0] == losses[1] > 0
+    validation = load_gift_i(tree, "validation", teacher=base, proxies_dir=tmp_path / "proxies")
+    stored_report = evaluate_gift_i(validation, model, progress=False)
+    computed = evaluate_gift_i(load_gift_i(tree, "validation"), model, progress=False)
+    assert stored_report.summary == computed.summary and stored_report.gce == computed.gce
+    reference = model.predict_proxies(model.inputs([validation[0]["reference"]]))[0]
+    for index, row in enumerate(stored_report.rows):
+        own = collate_group(validation[0], model.processor, SIZE).valid[index]
+        assert row["pixels"]["all"] == int((own & (reference != UNKNOWN)).sum()) < SIZE[0] * SIZE[1]
+    plain = DepthModel.from_pretrained(write_base(tmp_path / "plain"), size=SIZE)
+    pixels = group.pixel_values
+    assert torch.equal(plain.predict_proxies(pixels), plain.predict_base(pixels))
+
+
+def test_a_surface_run_takes_it(tiny_vit, tmp_path):
+    base, tree = write_base(tmp_path / "base", sky=True), write_raw_tree(tmp_path / "raw")
+    options = {"size": "28x56", "target": "surface", "max_steps": 3, "proxies_dir": str(tmp_path / "proxies")}
+    result = train(arguments(base, tree, tmp_path / "out", checkpointing_steps=None, **options))
+    assert result.step == 3 and np.isfinite(result.metrics[-1]["loss"])
+
+
+@pytest.mark.slow
+def test_trained_on_the_embedded_groups(tiny_vit, tmp_path):
+    base, out = write_base(tmp_path / "base"), tmp_path / "out"
+    files = {path.name: path.read_bytes() for path in base.iterdir()}
+    options = {"size": "56x70", "learning_rate": 3e-4, "num_train_epochs": 3, "checkpointing_steps": None}
+    result = train(arguments(base, EMBEDDED, out, proxies_dir=str(tmp_path / "proxies"), **options))
+    losses = [row["loss"] for row in result.metrics]
+    assert result.metrics[0]["distillation"] == 0 and losses[-1] < 0.9 * losses[0], losses
+    assert {path.name: path.read_bytes() for path in base.iterdir()} == files
+    teacher = AutoModelForDepthEstimation.from_pretrained(base)
+    adapted = PeftModel.from_pretrained(AutoModelForDepthEstimation.from_pretrained(base), out / "adapter-last").eval()
+    again = PeftModel.from_pretrained(AutoModelForDepthEstimation.from_pretrained(base), out / "adapter-last").eval()
+    with torch.no_grad():
+        for size in ((56, 70), (84, 112), (97, 61)):
+            pixels = torch.rand(2, 3, *size)
+            depth = adapted(pixel_values=pixels).predicted_depth
+            assert torch.equal(again(pixel_values=pixels).predicted_depth, depth)
+            with adapted.disable_adapter():
+                assert torch.equal(adapted(pixel_values=pixels).predicted_depth, teacher(pixels).predicted_depth)
+        merged = again.merge_and_unload()
+        merged.save_pretrained(tmp_path / "merged")
+        exported = AutoModelForDepthEstimation.from_pretrained(tmp_path / "merged")
+        for size in ((56, 70), (84, 112), (97, 61)):
+            pixels = torch.rand(2, 3, *size)
+            depth = adapted(pixel_values=pixels).predicted_depth
+            torch.testing.assert_close(exported(pixels).predicted_depth, depth, rtol=1e-4, atol=1e-5)
+    assert json.loads((out / "adapter-last" / "gift.json").read_text())["model_type"] == "gift_moge"
+
+
+@pytest.mark.slow
+def test_the_documented_command_is_enough(tmp_path):
+    """In a fresh environment that sees what is installed here: the packages named, and nothing else of theirs."""
+    import subprocess
+
+    venv.create(tmp_path / "env", with_pip=True)
+    python = tmp_path / "env" / "bin" / "python"
+    here = [path for path in sys.path if path.endswith("site-packages")] + [str(Path(__file__).parents[2] / "src")]
+    site = next((tmp_path / "env" / "lib").glob("python*/site-packages"))
+    (site / "here.pth").write_text("\n".join(here) + "\n")
+    words = INSTALL.split()
+    assert words[:2] == ["pip", "install"] and "--no-deps" in words
+    done = subprocess.run([python, "-m", "pip", "install", "-q", *words[2:]], capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip(f"the package index does not answer: {done.stderr.strip().splitlines()[-1]}")
+    code = (
+        "import sys, torch, cv2; from gift_peft import MogeConfig, MogeForDepthEstimation;"
+        "model = MogeForDepthEstimation(MogeConfig(variant='moge-2-vits-normal')).eval();"
+        "depth = model(torch.rand(1, 3, 70, 98), num_tokens=24).predicted_depth; assert depth.shape == (1, 70, 98);"
+        "assert not {'gradio', 'torchvision'} & set(sys.modules)"
+    )
+    done = subprocess.run([python, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    listed = subprocess.run([python, "-m", "pip", "list", "--path", site], capture_output=True, text=True).stdout
+    assert "opencv-python " not in listed and "gradio" not in listed and "torchvision" not in listed

@@ -105,14 +105,14 @@ def run_report(
     if card and not saved[0].arguments:
         raise ValueError(f"{saved[0].path}: no config.yaml, so nothing says what was trained; name the run's folder")
     planned = [run for run in saved if run.path.is_file()]
-    if card and (planned or card is not True):
-        check_own_file(Path("model_card.md" if card is True else card), MARK, "--model-card")
     if planned and not card:
         raise ValueError(f"{planned[0].path}: not a run yet; --model-card FILE writes the card of what it will be")
-    if planned:
-        path = Path("model_card.md") if card is True else Path(card)
-        check_inputs_stay([path], [saved[0].path])
-        return _write_card(saved[0], path)
+    if card and (planned or card is not True):
+        path = Path("model_card.md" if card is True else card)
+        check_inputs_stay([path], [run.path for run in planned])
+        check_own_file(path, MARK, "--model-card")
+        if planned:
+            return _write_card(saved[0], path)
     if zero_shot:  # fail early on a missing picture or checkpoint
         list_images(zero_shot)
         for run in saved:

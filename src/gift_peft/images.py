@@ -145,12 +145,11 @@ def _pages(image: Image.Image) -> int:
     """How many pictures of its size a file of a kind for several holds. MPO, AVIF and HEIC say which one is the photo;
     TIFF also keeps small previews.
     """
-    if image.format not in ("TIFF", "GIF", "PNG", "WEBP") or getattr(image, "n_frames", 1) == 1:
-        return 1
-    if image.format != "TIFF":
-        return image.n_frames
+    pages = getattr(image, "n_frames", 1) if image.format in ("TIFF", "GIF", "PNG", "WEBP") else 1
+    if pages == 1 or image.format != "TIFF":
+        return pages
     size, count = image.size, 0
-    for page in range(image.n_frames):
+    for page in range(pages):
         image.seek(page)
         count += image.size == size
     image.seek(0)

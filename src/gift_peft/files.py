@@ -13,6 +13,12 @@ from typing import Any
 
 import yaml
 
+# What systems and network drives leave beside a person's files; `__MACOSX` comes out of zip files of a Mac.
+LEFTOVERS = {
+    "__macosx", "@eadir", "#recycle", "@recycle", "#snapshot", "$recycle.bin", "system volume information",
+    "lost+found", "thumbs.db", "ehthumbs.db", "desktop.ini", "resource.frk", "network trash folder", "temporary items",
+    "__pycache__",
+}  # fmt: skip
 _OPENS_FOLDERS = os.name != "nt"  # Windows does not, so there only files are synced
 
 
@@ -78,6 +84,13 @@ def remove_folder(folder: Path) -> None:
     shutil.rmtree(gone)
 
 
+def is_leftover(name: str) -> bool:
+    """Whether a file or folder of this name is passed over wherever a person's files are listed: hidden ones
+    (`.DS_Store`, `._photo.jpg`, `.AppleDouble`), and those of `LEFTOVERS`.
+    """
+    return name.startswith(".") or name.casefold() in LEFTOVERS
+
+
 def read_yaml(path: Path, name: str | None = None) -> dict:
     """The mapping in a YAML file, {} for an empty one; `name` is how messages call the file, default its path.
 
@@ -87,7 +100,7 @@ def read_yaml(path: Path, name: str | None = None) -> dict:
     if not path.is_file():
         raise FileNotFoundError(f"{name}: no such file")
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{name}: not valid YAML ({' '.join(str(error).split())})") from None
     if not isinstance(values or {}, dict):

@@ -7,24 +7,71 @@ so in one line that names the file.
 import base64
 import hashlib
 import io
+import logging
 import re
 import struct
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageOps
 
-from gift_peft.files import reason
+from gift_peft.files import is_leftover, reason
 
-SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm"}
+logger = logging.getLogger(__name__)
+
+JPEG_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".mpo"}  # .mpo: several JPEGs, of which the first is the photo
+SUFFIXES = JPEG_SUFFIXES | {".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".avif"}
+HEIF_SUFFIXES = {".heic", ".heif", ".hif"}
+HEIF_BRANDS = {b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"}
+HEIF_HINT = "pip install 'gift-peft[heif]' reads HEIC, or export it as JPEG"
+LOSSY = {"JPEG", "MPO", "WEBP", "AVIF", "HEIF"}  # formats that do not keep the values of a mask
+# Files that people and cameras put beside photos and that are no pictures.
+COMPANIONS = {
+    ".txt", ".md", ".rst", ".csv", ".tsv", ".json", ".jsonl", ".yaml", ".yml", ".toml", ".xml", ".html", ".pdf",
+    ".log", ".xmp", ".aae", ".thm", ".lrc", ".lnk", ".url", ".py", ".ipynb", ".npy", ".npz", ".parquet",
+    ".safetensors", ".dvc", ".lock",
+}  # fmt: skip
 SINGLE_CHANNEL = ("1", "L", "P", "I", "I;16", "I;16B", "I;16L")
 
 
 def is_image_file(path: Path) -> bool:
     """Whether a folder's entry counts as a picture: by its suffix, and not hidden."""
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+    suffix = path.suffix.lower()
+    return (suffix in SUFFIXES or (suffix in HEIF_SUFFIXES and reads_heif())) and not is_leftover(path.name)
+
+
+@lru_cache
+def reads_heif() -> bool:
+    """Whether HEIC can be read: the extra `heif` is installed. Then Pillow opens it from now on."""
+    if find_spec("pillow_heif") is None:
+        return False
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    return True
+
+
+def skipped_files(paths: Iterable[Path]) -> list[Path]:
+    """Those of a folder's files that are neither read nor meant to lie beside photos, in natural order: pictures of
+    kinds that are not read, videos, and what is not known.
+    """
+    skipped = [
+        path
+        for path in paths
+        if not (is_image_file(path) or path.suffix.lower() in COMPANIONS or is_leftover(path.name))
+    ]
+    return sorted(skipped, key=lambda path: natural_key(path.as_posix()))
+
+
+def name_skipped(names: Sequence[str]) -> str:
+    """How messages tell of files that are not read: their number, their names, and what helps."""
+    heif = any(Path(name).suffix.lower() in HEIF_SUFFIXES for name in names)
+    count = f"{len(names)} file{'s are' if len(names) != 1 else ' is'} not read"
+    return f"{count}: {', '.join(names)}" + (f" ({HEIF_HINT})" if heif else "")
 
 
 def open_image(source: str | Path | bytes | Image.Image, name: str | None = None) -> Image.Image:
@@ -34,22 +81,62 @@ def open_image(source: str | Path | bytes | Image.Image, name: str | None = None
     """
     name = name or str(source)
     try:
-        if isinstance(source, Image.Image):
-            image = source
-        else:
-            image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source)
+        image = source if isinstance(source, Image.Image) else _opened(source)
         # Pillow reduces 16-bit RGB to 8 bits while decoding; only the tiles of a file not yet decoded tell.
         deep = any(";16" in str(tile[-1]) for tile in getattr(image, "tile", ()))
         image.load()
         if image.getexif().get(Image.ExifTags.Base.Orientation) is not None:
+            stored = image.format
             image = ImageOps.exif_transpose(image)
+            image.format = stored  # a copy has none, and masks go by it
     except FileNotFoundError:
-        raise FileNotFoundError(f"{name}: no such file") from None
+        dangling = isinstance(source, str | Path) and Path(source).is_symlink()
+        why = "; the link leads nowhere: fetch its content (git annex get, dvc pull, hf download)" if dangling else ""
+        raise FileNotFoundError(f"{name}: no such file{why}") from None
     except (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError) as error:
-        raise ValueError(f"{name}: not a readable image, or truncated ({reason(error)})") from None
+        hint = f"; it is HEIC: {HEIF_HINT}" if _is_heif(source) and not reads_heif() else f" ({reason(error)})"
+        raise ValueError(f"{name}: not a readable image, or truncated{hint}") from None
     if deep and image.mode not in SINGLE_CHANNEL:
         raise ValueError(f"{name}: a 16-bit image; save it with 8 bits per channel")
     return image
+
+
+def _opened(source: str | Path | bytes) -> Image.Image:
+    try:
+        return Image.open(io.BytesIO(source) if isinstance(source, bytes) else source)
+    except Image.UnidentifiedImageError:
+        if not (_is_heif(source) and reads_heif()):  # which registers the reader
+            raise
+        return Image.open(io.BytesIO(source) if isinstance(source, bytes) else source)
+
+
+def _is_heif(source: str | Path | bytes | Image.Image) -> bool:
+    """By the content: phones also call such files .jpg."""
+    if isinstance(source, Image.Image):
+        return False
+    try:
+        start = source[:12] if isinstance(source, bytes) else _first_bytes(source)
+    except OSError:
+        return False
+    return start[4:8] == b"ftyp" and start[8:12] in HEIF_BRANDS
+
+
+def _first_bytes(path: str | Path) -> bytes:
+    with open(path, "rb") as file:
+        return file.read(12)
+
+
+def hidden_turn(path: Path) -> int | None:
+    """The EXIF orientation of a photo where turning it upright does not change its size (180 degrees, mirrored, or a
+    square photo), so that nothing tells whether a program went by it; else None.
+    """
+    try:
+        with _opened(path) as image:
+            orientation = image.getexif().get(Image.ExifTags.Base.Orientation)
+            keeps = orientation in (2, 3, 4) or (orientation in (5, 6, 7, 8) and image.width == image.height)
+            return orientation if keeps else None
+    except (OSError, SyntaxError, ValueError):
+        return None  # whoever reads it says why
 
 
 def to_rgb(image: Image.Image, name: str) -> Image.Image:
@@ -73,27 +160,79 @@ def read_image(source: str | Path | bytes | Image.Image, name: str | None = None
 
 
 def to_mask(image: Image.Image, name: str, target_class: int | Sequence[int] | None = None) -> np.ndarray:
-    """The (H, W) bool target region of a single-channel mask.
+    """The (H, W) bool target region of a mask in one channel, or in grey saved as RGB, RGBA, LA or palette.
 
     Without `target_class` the mask has at most two values: up to 1, what is above 0 is target; else what is at least
-    128. With it (a value or several, from `group.yaml`), pixels of those values are target. Raises ValueError.
+    128. In a JPEG (or another lossy format) nearly all are close to black or white, and it is cut at 128. With it (a
+    value or several, from `group.yaml`), pixels of those values are target: of a palette picture its numbers, or its
+    grey values if none of its numbers is meant. Colors without a class raise ValueError, as does real transparency.
     """
-    if image.mode not in SINGLE_CHANNEL:
-        raise ValueError(f"{name}: mode {image.mode}; a mask has a single channel")
-    values = np.asarray(image)
-    if target_class is not None:
-        return np.isin(values, target_class)
+    if image.mode == "P" and target_class is not None:
+        return _palette_class(image, name, np.atleast_1d(target_class))
+    values = np.asarray(image) if image.mode in SINGLE_CHANNEL and image.mode != "P" else _grey(image, name)
     if values.dtype == bool:
-        return values
+        return values if target_class is None else np.isin(values * 255, target_class) | np.isin(values, target_class)
     levels = (
         np.flatnonzero(np.bincount(values.ravel(), minlength=2)) if values.dtype == np.uint8 else np.unique(values)
     )
+    if len(levels) > 2 and image.format in LOSSY:
+        black, white = values <= 32, values >= 223
+        near = float((black | white).mean())
+        if target_class not in (None, 255, [255]) or near < 0.99 or not (black.any() and white.any()):
+            raise ValueError(
+                f"{name}: {len(levels)} different values, {near:.1%} of the pixels near black or white, in a format "
+                f"({image.format}) that does not keep them; save the mask as PNG"
+            )
+        return values >= 128
+    if target_class is not None:
+        return np.isin(values, target_class)
     if len(levels) > 2:
         raise ValueError(
             f"{name}: {len(levels)} different values ({', '.join(map(str, levels[:4]))}, ...); a mask has at most "
             "two, or name the target's value in group.yaml (`mask_class: 2`)"
         )
     return values > 0 if values.max(initial=0) <= 1 else values >= 128
+
+
+def _grey(image: Image.Image, name: str) -> np.ndarray:
+    """(H, W) uint8 of a picture in color channels that holds grey only; what is transparent is 0.
+
+    ValueError for colors, and where transparency and grey contradict each other.
+    """
+    if image.mode not in ("P", "PA", "LA", "RGB", "RGBA"):
+        raise ValueError(f"{name}: mode {image.mode}; a mask has a single channel")
+    pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+    opaque = pixels[..., 3] == 255 if pixels.shape[-1] == 4 else np.ones(pixels.shape[:2], bool)
+    spread = pixels[..., :3].max(axis=-1).astype(int) - pixels[..., :3].min(axis=-1)
+    if (spread[opaque] > (16 if image.format in LOSSY else 0)).any():
+        hint = (
+            "name the target's number in group.yaml (`mask_class: 1`), or save it" if image.mode == "P" else "save it"
+        )
+        raise ValueError(f"{name}: mode {image.mode}; a mask has a single channel, or grey: {hint} as black and white")
+    grey = pixels[..., 1]
+    if opaque.all():
+        return grey
+    white, hidden = opaque & (grey >= 128), ~opaque & (grey >= 128)
+    # Painted white on nothing, whatever color nothing has; or black and white, with black where it is transparent.
+    sure = white.any() and ((white == opaque).all() or not hidden.any())
+    empty = not opaque.any() and not grey.any()
+    if (pixels[..., 3][~opaque] > 0).any() or not (sure or empty):
+        raise ValueError(f"{name}: the mask has transparent pixels that may mean either; save it as black and white")
+    return np.where(opaque, grey, np.uint8(0))
+
+
+def _palette_class(image: Image.Image, name: str, classes: np.ndarray) -> np.ndarray:
+    by_number = np.isin(np.asarray(image), classes)
+    pixels = np.asarray(image.convert("RGB"))
+    if (pixels != pixels[..., :1]).any():
+        return by_number
+    by_grey = np.isin(pixels[..., 0], classes)
+    if by_number.any() and by_grey.any() and (by_number != by_grey).any():
+        raise ValueError(
+            f"{name}: mask_class {', '.join(map(str, classes))} is a palette number and, elsewhere, a grey value; "
+            "save the mask without a palette"
+        )
+    return by_number if by_number.any() else by_grey
 
 
 def image_digest(image: Image.Image) -> str:
@@ -123,15 +262,28 @@ def sort_pictures(paths: Iterable[Path]) -> list[Path]:
 
 
 def list_images(images: Sequence[str | Path]) -> list[Path]:
-    """Picture files, and those of the folders named; FileNotFoundError or ValueError where there are none."""
+    """Picture files, and those of the folders named; FileNotFoundError or ValueError where there are none.
+
+    A warning names the files of those folders that are not read.
+    """
     files: list[Path] = []
+    skipped: list[Path] = []
     for path in map(Path, images):
-        files += sort_pictures(path.iterdir()) if path.is_dir() else [path]
+        if path.is_dir():
+            if path.name in (".", "..") or not is_leftover(path.name) or len(images) == 1:
+                inside = [entry for entry in path.iterdir() if not entry.is_dir()]
+                files += sort_pictures(inside)
+                skipped += skipped_files(inside)
+        elif not is_leftover(path.name) or len(images) == 1:  # of a pattern that a shell expanded
+            files.append(path)
     missing = [str(path) for path in files if not path.is_file()]
     if missing:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
         raise FileNotFoundError(f"no such image: {missing[0]}{more}")
+    told = name_skipped(list(map(str, skipped))) if skipped else ""
     if not files:
         listed = ", ".join(map(str, images)) or "an empty list"
-        raise ValueError(f"no images in {listed} (folders within folders are not searched)")
+        raise ValueError(f"no images in {listed} (folders within folders are not searched)" + (told and f"; {told}"))
+    if told:
+        logger.warning("%s", told)
     return files

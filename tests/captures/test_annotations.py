@@ -6,7 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from gift_peft.captures.annotations import coco_mask, ellipse_points, label_studio_mask, polygon_mask, rectangle_points
+from gift_peft.captures.coco import coco_mask
+from gift_peft.captures.label_studio import label_studio_mask
+from gift_peft.captures.shapes import ellipse_points, polygon_mask, rectangle_points
 
 
 def inside(x: float, y: float, corners) -> bool | None:

@@ -60,7 +60,10 @@ GOOD = {
     "labelme polygon": ("1.json", labelme()),
     "labelme rectangle": ("1.json", labelme([[9, 6], [3, 2]], "rectangle")),
     "labelme without sizes": ("masks/1.json", {"shapes": labelme()["shapes"]}),
-    "labelme in annotations": ("annotations/1.json", labelme()),
+    "labelme in annotations": ("annotations/1.json", labelme(imagePath="../1.jpg")),
+    "labelme of Windows": ("annotations/1.json", labelme(imagePath="..\\images\\1.jpg")),
+    "labelme of another machine": ("masks/1.json", labelme(imagePath="C:\\Users\\me\\1.jpg")),
+    "labelme absolute": ("1.json", labelme(imagePath="/home/me/1.jpg")),
     "coco polygon": ("annotations/instances_default.json", coco(segmentation=[POLYGON])),
     "coco two polygons": ("x.json", coco(segmentation=[POLYGON, [4, 3, 5, 3, 5, 5]])),
     "coco run lengths": ("x.json", coco(segmentation={"size": [8, 12], "counts": run_lengths(BOX)}, iscrowd=1)),
@@ -108,13 +111,14 @@ def test_labelme_circle_and_stored_mask(group):
 
 def test_one_label_is_the_target_and_several_need_a_class(group):
     content = labelme()
-    content["shapes"].append({"label": "table", "points": [[0, 0], [12, 0], [12, 8], [0, 8]], "shape_type": "polygon"})
+    table = {"label": "table", "points": [[0, 0], [12, 0], [12, 8], [0, 8]], "shape_type": "polygon"}
+    content["shapes"].insert(0, table)  # below the glass
     write(group / "1.json", content)
-    with pytest.raises(ValueError, match=r"1\.json: 2 labels \(glass, table\); name the target's"):
+    with pytest.raises(ValueError, match=r"1\.json: 2 labels \(table, glass\); name the target's"):
         look(group).read(SIZE)
     np.testing.assert_array_equal(look(group, "glass").read(SIZE), BOX)
     assert look(group, ["glass", "table"]).read(SIZE).all()
-    with pytest.raises(ValueError, match=r"1\.json: mask_class 'mirror' is none of the labels there \(glass, table\)"):
+    with pytest.raises(ValueError, match=r"1\.json: mask_class 'mirror' is none of the labels there \(table, glass\)"):
         look(group, "mirror").read(SIZE)
 
 
@@ -169,12 +173,16 @@ def labelme_at(path):
 BAD = {
     "other size": ("masks/1.png", picture(BOX.T), "masks/1.png: the mask is 12x8"),
     "truncated": ("masks/1.png", "\x89PNG", "masks/1.png: not a readable image"),
-    "colours": ("masks/1.png", np.zeros((8, 12, 3), np.uint8), "masks/1.png: mode RGB"),
+    "colours": ("masks/1.png", np.full((8, 12, 3), (9, 0, 0), np.uint8), "masks/1.png: mode RGB"),
     "labelme other size": ("1.json", labelme(imageWidth=13), "1.json: its shapes are for 8x13"),
-    "labelme absolute": ("1.json", labelme_at("/home/me/1.jpg"), "1.json: imagePath: '/home/me/1.jpg' is an absolute"),
-    "labelme climbs": ("1.json", labelme_at("..\\1.jpg"), "absolute path or climbs"),
-    "labelme drive": ("1.json", labelme_at("C:\\1.jpg"), "absolute path or climbs"),
     "labelme other image": ("1.json", labelme_at("2.jpg"), "1.json: drawn on 2.jpg, not on 1.jpg"),
+    "labelme other, climbs": (
+        "annotations/1.json",
+        labelme_at("..\\1\\2.jpg"),
+        r"drawn on ..\\1\\2.jpg, not on 1.jpg",
+    ),
+    "labelme other, absolute": ("masks/1.json", labelme_at("/etc/1.jpg/passwd"), "drawn on /etc/1.jpg/passwd"),
+    "labelme no name": ("1.json", labelme_at(7), "1.json: imagePath: 7 is not an image's name"),
     "labelme cut short": ("1.json", '{"shapes": [', "1.json: not valid JSON, or cut short"),
     "labelme no label": ("1.json", labelme(label=None), "1.json: a shape, region or category without a label"),
     "labelme line": ("1.json", labelme(CORNERS[:2], "line"), "type 'line' with 2 points has no area"),
@@ -267,7 +275,6 @@ def test_nothing_and_things_that_are_no_masks(group):
     write(group / "1.json", {"exposure": 4})  # a camera's notes
     write(group / "camera.json", {"fx": 600})
     write(group / "x.json", coco("other.jpg"))
-    write(group.parents[1] / "all.json", coco("1.jpg"))  # above the group a name must say which group
     write(group.parents[2] / "x.json", coco("raw/train/scene/1.jpg"))  # outside the root
     assert look(group) is None
 
@@ -292,22 +299,6 @@ def test_accents_match_however_they_are_written(group):
     Image.new("RGB", SIZE).save(group / "e\u0301.jpg")  # e and accent apart, as macOS stores it
     write(group / "x.json", coco("\u00e9.jpg"))
     np.testing.assert_array_equal(look(group, image="e\u0301.jpg").read(SIZE), BOX)
-
-
-def test_links_stay_inside_the_root(group, tmp_path):
-    outside = write(tmp_path / "outside.png", picture())
-    (group / "masks").mkdir()
-    link = group / "masks/1.png"
-    link.symlink_to(outside)
-    with pytest.raises(ValueError, match=r"masks/1\.png: a link that leads out of"):
-        look(group)
-    link.unlink()
-    link.symlink_to("1.png")  # to itself
-    with pytest.raises(ValueError, match=r"masks/1\.png: a link that leads nowhere"):
-        look(group)
-    link.unlink()
-    link.symlink_to(write(group.parents[1] / "shared.png", picture()))
-    np.testing.assert_array_equal(look(group).read(SIZE), BOX)
 
 
 def test_a_changed_export_is_read_again(group):

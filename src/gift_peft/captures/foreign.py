@@ -27,7 +27,7 @@ from pathlib import Path, PurePosixPath
 
 from gift_peft.captures.masks import MaskSource
 from gift_peft.captures.tree import Capture
-from gift_peft.files import read_yaml
+from gift_peft.files import is_leftover, read_yaml
 from gift_peft.images import natural_key, sort_pictures
 from gift_peft.rules import SPLITS
 
@@ -58,7 +58,11 @@ class Layout:
             found = {}
             for split, name in self.splits.items():
                 folder = _below(base, name, f"splits, {split}")
-                folders = [path for path in sorted(folder.rglob("*")) if path.is_dir()] if folder.is_dir() else []
+                folders = [
+                    path
+                    for path in (sorted(folder.rglob("*")) if folder.is_dir() else [])
+                    if path.is_dir() and not any(map(is_leftover, path.relative_to(folder).parts))
+                ]
                 found[split] = [path for path in [folder, *folders] if any(_pictures(path, self.images))]
         if not any(found.values()):
             raise FileNotFoundError(f"{base}: the layout finds no captures there")
@@ -88,7 +92,7 @@ class Layout:
     def _from_list(self, base: Path, split: str, name: str) -> Iterator[Capture]:
         path = _below(base, name, f"lists, {split}")
         try:
-            lines = path.read_text(encoding="utf-8").splitlines()
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
         except FileNotFoundError:
             raise FileNotFoundError(f"{path}: no such file, which the layout names") from None
         except UnicodeDecodeError:

@@ -6,7 +6,20 @@ from importlib.util import find_spec
 from gift_peft.options import package_version
 
 # All code that decides what a raw tree becomes.
-SOURCES = ("dataset.gift_i", "captures.tree", "captures.masks", "captures.annotations", "images", "rules")
+CAPTURES = (
+    "tree",
+    "masks",
+    "folders",
+    "links",
+    "exports",
+    "labels",
+    "shapes",
+    "labelme",
+    "coco",
+    "label_studio",
+    "cvat",
+)
+SOURCES = ("dataset.gift_i", *(f"captures.{name}" for name in CAPTURES), "images", "rules")
 
 
 def register_builder() -> None:
@@ -17,6 +30,9 @@ def register_builder() -> None:
     """
     from datasets import packaged_modules
 
+    from gift_peft.images import reads_heif
+
+    reads_heif()  # rows hold paths, and `datasets` decodes them: with the extra, HEIC as well
     module = f"{__name__}.gift_i"
     packaged_modules._PACKAGED_DATASETS_MODULES["gift_i"] = (module, _code_digest())
 

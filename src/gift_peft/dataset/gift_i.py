@@ -54,7 +54,10 @@ class GiftIConfig(datasets.BuilderConfig):
     """Adds the tree's listing (names, sizes, times) to the cache key: a changed folder is read again.
 
     `datasets` keys the cache by the files it guesses from split words in path names, which may be some or none.
+    `empty_masks` ("refuse" or "allow") says what photos without a target are in groups whose others have one.
     """
+
+    empty_masks: str = "refuse"
 
     def create_config_id(self, config_kwargs: dict, custom_features=None) -> str:
         config_id = super().create_config_id(config_kwargs, custom_features)
@@ -82,25 +85,35 @@ class GiftI(datasets.GeneratorBasedBuilder):
                     "groups": [str(group) for group in groups],
                     "split": split,
                     "root": str(self.config.data_dir),
+                    "empty_masks": self.config.empty_masks,
                 },
             )
             for split, groups in list_groups(self.config.data_dir).items()
         ]
 
-    def _generate_shards(self, groups, split, root):
+    def _generate_shards(self, groups, split, root, empty_masks):
         yield from groups
 
-    def _generate_examples(self, groups, split, root):
+    def _generate_examples(self, groups, split, root, empty_masks):
         for shard, folder in enumerate(groups):
-            yield Key(shard, 0), raw_example(Path(folder), split, Path(root))
+            yield Key(shard, 0), raw_example(Path(folder), split, Path(root), empty_masks)
 
 
 def _listing_digest(folder: str) -> str:
-    digest = hashlib.sha256()
-    for root, folders, files in os.walk(folder):
+    digest, seen = hashlib.sha256(), set()
+    for root, folders, files in os.walk(folder, followlinks=True):
+        real = os.path.realpath(root)
+        if real in seen:  # links in a loop; reading the tree says so
+            folders.clear()
+            continue
+        seen.add(real)
         folders[:] = sorted(name for name in folders if name != "proxies" and not name.startswith("."))
         for name in sorted(files):
-            stat = os.stat(os.path.join(root, name))
+            try:
+                stat = os.stat(os.path.join(root, name))
+            except OSError as error:  # a link that leads nowhere
+                digest.update(f"{os.path.relpath(root, folder)}/{name} {error.errno}\n".encode())
+                continue
             digest.update(f"{os.path.relpath(root, folder)}/{name} {stat.st_size} {stat.st_mtime_ns}\n".encode())
     return digest.hexdigest()[:16]
 
@@ -117,6 +130,7 @@ def load_gift_i(
     size: tuple[int, int] | None = None,
     dataset_revision: str | None = None,
     surface: SurfaceSettings | None = None,
+    empty_masks: str = "refuse",
 ) -> datasets.Dataset:
     """GIFT-I groups, checked, as a `datasets.Dataset` with `FEATURES`; with a teacher also their proxies.
 
@@ -136,11 +150,13 @@ def load_gift_i(
         dataset_revision (`str`, *optional*): of a hub dataset.
         surface (`SurfaceSettings`, *optional*): with a teacher, attaches the surface targets made with these settings:
             accessed rows also have `surface_target` and `surface_target_flipped` (N, h, w), float32 tensors.
+        empty_masks (`str`): of a raw tree, what photos without a target are in groups whose others have one: an error
+            ("refuse"), or photos in which no target shows ("allow"). `empty_masks` in a `group.yaml` comes first.
 
     Raises:
         FileNotFoundError, ValueError: one line that names the file or group and says what to do.
     """
-    dataset = _load_rows(path, split, dataset_revision)
+    dataset = _load_rows(path, split, dataset_revision, empty_masks)
     name = re.match(r"\w*", str(split)).group()
     dataset = _check_rows(dataset, name, path)
     rules = RowRules(train=name == "train")
@@ -198,7 +214,7 @@ def _holds_parquet(folder: Path) -> bool:
     return any(folder.glob("*.parquet")) or any(folder.glob("*/*.parquet"))
 
 
-def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.Dataset:
+def _load_rows(path: str | Path, split: str, revision: str | None, empty_masks: str) -> datasets.Dataset:
     """Rows whose images are still paths or bytes, under FEATURES."""
     folder = Path(path)
     if "+" in str(split):
@@ -215,7 +231,7 @@ def _load_rows(path: str | Path, split: str, revision: str | None) -> datasets.D
         if _holds_parquet(folder):
             return datasets.load_dataset(str(folder), split=split, features=FEATURES)
         _check_split(split, list_groups(folder), path)
-        builder = GiftI(data_dir=str(folder))
+        builder = GiftI(data_dir=str(folder), empty_masks=empty_masks)
         builder.download_and_prepare()
         return builder.as_dataset(split=split)
     except (FileNotFoundError, ValueError):

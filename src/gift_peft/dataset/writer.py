@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from gift_peft.files import whole_folder, write_whole
-from gift_peft.images import image_digest, open_image, to_mask, to_rgb
+from gift_peft.images import HEIF_SUFFIXES, JPEG_SUFFIXES, image_digest, open_image, to_mask, to_rgb
 from gift_peft.rules import SPLITS, SURFACES, check_group_id, parse_group
 
 NAMES = pa.list_(pa.string())
@@ -199,14 +199,16 @@ def _save(item, stem: Path) -> str:
     """Write one picture under `stem` and return its file name: files are copied, everything else becomes PNG."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(item, str | Path):
-        target = stem.with_name(stem.name + Path(item).suffix.lower())
-        shutil.copyfile(item, target)
-        return target.name
+        suffix = Path(item).suffix.lower()
+        if suffix not in (*HEIF_SUFFIXES, ".avif"):  # those become PNG: not every reader of the folder knows them
+            target = stem.with_name(stem.name + (".jpg" if suffix in JPEG_SUFFIXES else suffix))
+            shutil.copyfile(item, target)
+            return target.name
     target = stem.with_name(stem.name + ".png")
     if isinstance(item, np.ndarray):
         item = Image.fromarray(item.astype(np.uint8) * 255 if item.dtype == bool else item)
     else:
-        item = _rgb(item, stem.name)
+        item = _rgb(item, str(item) if isinstance(item, str | Path) else stem.name)
     item.save(target, compress_level=4)  # of a photo as small as at the usual 6, in a third of the time
     return target.name
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from gift_peft.captures.tree import Capture, check_masks, decode_capture
+from gift_peft.captures.tree import Capture, Decoded, check_masks, decode_capture
 from gift_peft.dataset.writer import write_group
 from gift_peft.prepare.entries import FrameEntry, GroupEntry, GroupQuality, ReferenceQuality, Remark
 from gift_peft.prepare.frame_bar import note_frame
@@ -64,6 +64,11 @@ class Photo:
     @property
     def warped(self) -> bool:
         return self.entry.status == "warped"
+
+    @property
+    def map(self) -> np.ndarray:
+        """(3, 3): from its pixels to the target frame's, once it is registered."""
+        return self.matrix if self.warped else np.eye(3)
 
     @property
     def gray(self) -> np.ndarray:
@@ -120,10 +125,12 @@ def _make(capture: Capture, job: Job, entry: GroupEntry, proposed_from: str) -> 
     """The staged group's metadata row."""
     if not job.settings.propose_masks:
         check_masks(capture)
-    photos, reference = decode(capture, entry)
+    photos, reference, decoded = decode(capture, job, entry)
     entry.target_frame = photos[-1].entry.name
     static = job.settings.static_rig or capture.facts.get("static_rig", False)
-    if any(photo.mask is None for photo in photos):
+    if decoded.common is not None:
+        photos = carry_mask(photos, decoded.common, decoded.common_from, static, job)
+    elif any(photo.mask is None for photo in photos):
         propose_masks(photos, reference, static, job, entry, proposed_from)
     register_photos(photos, reference, static, job)
     check(photos, reference, job, entry)
@@ -141,12 +148,13 @@ def list_frames(capture: Capture, job: Job, entry: GroupEntry) -> None:
         entry.frames.append(FrameEntry(printable(name), role, job.relative(path)))
 
 
-def decode(capture: Capture, entry: GroupEntry) -> tuple[list[Photo], Photo | None]:
-    """The observations without those that occur twice, and the treated reference."""
+def decode(capture: Capture, job: Job, entry: GroupEntry) -> tuple[list[Photo], Photo | None, Decoded]:
+    """The observations without those that occur twice, the treated reference, and what else was found."""
     for path in capture.images:
         if str(path) != printable(str(path)):
             raise ValueError(f"{path}: the name is not valid Unicode text; rename the file")
-    decoded = decode_capture(capture)
+    decoded = decode_capture(capture, job.settings.empty_masks, may_lack=job.settings.propose_masks)
+    entry.warnings += [Remark(code, printable(text)) for code, text in decoded.notes.items()]
     if capture.split == "train":
         check_pair(capture.group_id, len(decoded.kept))
     size = decoded.images[0].size
@@ -160,8 +168,8 @@ def decode(capture: Capture, entry: GroupEntry) -> tuple[list[Photo], Photo | No
         for index, image, mask in zip(decoded.kept, decoded.images, decoded.masks, strict=True)
     ]
     if decoded.reference is None:
-        return photos, None
-    return photos, Photo(entry.frames[-1], capture.reference, np.asarray(decoded.reference), None)
+        return photos, None, decoded
+    return photos, Photo(entry.frames[-1], capture.reference, np.asarray(decoded.reference), None), decoded
 
 
 def register_photos(photos: list[Photo], reference: Photo | None, static: bool, job: Job) -> None:
@@ -176,12 +184,38 @@ def register_photos(photos: list[Photo], reference: Photo | None, static: bool, 
     if reference is None:
         return
     # Nobody draws a mask for it, and the camera may have moved a little: the target's, and some more.
-    side = 2 * round(0.01 * float(np.hypot(*target.size))) + 1
-    around = None if last.mask is None else cv2.dilate(last.mask.astype(np.uint8), np.ones((side, side))) > 0
+    around = None if last.mask is None else _around(last.mask)
     reference.decide(register(Frame(reference.pixels, around, settings), target, static, treated=True))
     if reference.warped:
         text = "the camera moved before the treated reference was taken; it is warped"
         reference.entry.warnings.append(Remark("reference_moved", text))
+
+
+def _around(mask: np.ndarray) -> np.ndarray:
+    """The mask and a margin of a hundredth of the diagonal."""
+    side = 2 * round(0.01 * float(np.hypot(*mask.shape))) + 1
+    return cv2.dilate(mask.astype(np.uint8), np.ones((side, side))) > 0
+
+
+def carry_mask(photos: list[Photo], mask: np.ndarray, drawn_on: int | None, static: bool, job: Job) -> list[Photo]:
+    """Give the one mask of a group to the photos that have none, each where its camera sees it.
+
+    `drawn_on` is the photo of the mask, None for `mask.*`, which is of the target frame. Registered once for this,
+    with the place of the target roughly known, photos are registered again with their own masks. Returns those.
+    """
+    source = photos[-1] if drawn_on is None else photos[drawn_on]
+    lacking = [photo for photo in photos if photo.mask is None]
+    for photo in lacking:
+        photo.mask = mask if photo is source else _around(mask)
+    register_photos(photos, None, static, job)
+    if source.dropped:
+        text = "; ".join(item.text for item in source.entry.reasons)
+        raise Rejection("mask_not_carried", f"{source.entry.name} alone has a mask, and cannot be registered: {text}")
+    for photo in lacking:
+        if not photo.dropped:
+            there = np.linalg.inv(photo.map) @ source.map
+            photo.mask = mask if np.array_equal(there, np.eye(3)) else warp(mask, there)
+    return [photo for photo in photos if not photo.dropped]
 
 
 def propose_masks(

@@ -6,7 +6,7 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from gift_peft.captures.tree import Capture, read_capture
+from gift_peft.captures.tree import GROUP_FILES, Capture, read_capture
 from gift_peft.prepare.settings import PrepareSettings
 
 FORMAT = 1  # of records and report; a new one makes every group again
@@ -84,10 +84,10 @@ def proposal_choices(settings: PrepareSettings) -> dict:
 
 def capture_digest(capture: Capture, choices: dict) -> str:
     """Of the content of every file that decides what becomes of the group, and of what was chosen to do with it."""
-    stated = json.dumps([FORMAT, capture.split, choices], sort_keys=True)
+    stated = json.dumps([FORMAT, capture.split, choices, [path.name for path in capture.skipped]], sort_keys=True)
     digest = hashlib.blake2b(stated.encode(), digest_size=16)
-    files = [*capture.images, capture.folder / "group.yaml"]
-    files += [path for mask in capture.masks if mask is not None for path in mask.files]
+    files = [*capture.images, *(capture.folder / name for name in GROUP_FILES)]
+    files += [path for mask in (*capture.masks, capture.common) if mask is not None for path in mask.files]
     files += [capture.reference] if capture.reference is not None else []
     for path in dict.fromkeys(files):
         if path.is_file():

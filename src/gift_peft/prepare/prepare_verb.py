@@ -15,6 +15,7 @@ from gift_peft.options import OptionParser, did_you_mean, number
 from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
 
 PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
+NOTES = ("one_mask", "skipped_files", "exif_turned")  # what is said at the end, beside the report
 DESCRIPTION = """From a folder of photos to a checked GIFT-I dataset: register, check, write, report.
 
 Exit code: 0 if every group is in OUT, 3 if some were rejected (the report says why), 1 if none could be made, or RAW
@@ -42,6 +43,10 @@ def run(argv: Sequence[str]) -> int:
     if accepted:
         names = ", ".join(f"{e['split']}/{e['group_id']} (score {e['proposal']['score']:.2f})" for e in accepted)
         print(f"Masks that were proposed, not drawn, and accepted: {names}")
+    for entry in report["groups"]:
+        for note in entry["warnings"]:
+            if note["code"] in NOTES:
+                print(f"gift-peft: {entry['split']}/{entry['group_id']}: {note['text']}", file=sys.stderr)
     for split, found in report["statistics"].items():
         print(
             f"{split}: {found['groups']} groups, {found['images']} images ({found['warped_frames']} frames warped, "
@@ -89,7 +94,9 @@ def make_parser() -> OptionParser:
         group = parser if kind is PrepareSettings else parser.add_argument_group(*kind.__doc__.split(". ", 1))
         for name, option in _options(kind).items():
             form = {"metavar": option.metadata["metavar"]}
-            if isinstance(option.default, bool):
+            if "choices" in option.metadata:
+                form = {"choices": option.metadata["choices"]}
+            elif isinstance(option.default, bool):
                 form = {"action": argparse.BooleanOptionalAction}
             elif option.default is not None:
                 form["type"] = number(type(option.default), option.metadata["least"])

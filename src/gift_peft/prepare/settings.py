@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from gift_peft.captures.foreign import Layout
+from gift_peft.captures.tree import EMPTY_MASKS
 
 
 def _option(text: str, metavar: str = "X", least: int = 0) -> dict:
@@ -89,6 +90,11 @@ class PrepareSettings:
     )
     accept_proposed_masks: bool = _arg("use the proposed masks, which the dataset card then says", False)
     min_proposal_score: float = _arg("score (0 to 1) below which a proposed mask is never accepted", 0.5)
+    empty_masks: str = field(
+        default="refuse",
+        metadata=_option("what photos without a target are in a group whose others have one: an error, or fine")
+        | {"choices": EMPTY_MASKS},
+    )
     refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
     layout: Layout | None = field(
         default=None, metadata=_option("YAML file that says where RGB and mask files lie", metavar="FILE")

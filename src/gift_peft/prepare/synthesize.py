@@ -166,6 +166,8 @@ def _read_flat(photos: Path) -> Capture:
     capture = read_capture(photos, "train", photos)
     if any(path.parent != photos for path in capture.images):
         raise ValueError(mixed)
+    if capture.common is not None:
+        raise ValueError(f"{capture.common.path}: one mask for all photos of a group, and these are of many scenes")
     if MARK in capture.facts:
         raise ValueError(f"PHOTOS {photos}: these are painted copies already")
     if capture.reference is not None:
@@ -229,7 +231,7 @@ def _make_group(job: _Job) -> _Outcome:
 
 def _paint(job: _Job) -> tuple[list[Image.Image], np.ndarray]:
     """The photo and its painted copies, and the mask; ValueError or another error naming the file."""
-    path, source = job.capture.images[0], job.capture.masks[0]
+    path, source = job.capture.images[0], job.capture.masks[0] or job.capture.common
     image = read_image(path)
     mask = source.read(image.size)
     if not mask.any():

@@ -59,6 +59,7 @@ class Capture:
         common (`MaskSource`, *optional*): `mask.*`, for the observations that have none of their own.
         skipped (`list[Path]`): files of the folder that are not read.
         root (`Path`, *optional*): of the tree.
+        depth (`Path`, *optional*): measured depth of the treated surface, as the reference's camera sees it.
     """
 
     folder: Path
@@ -71,6 +72,7 @@ class Capture:
     common: MaskSource | None = None
     skipped: list[Path] = field(default_factory=list)
     root: Path | None = None
+    depth: Path | None = None
 
     def name(self, path: Path) -> str:
         """How an image is called in the dataset: its path inside the group's folder."""
@@ -170,7 +172,7 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
             raise ValueError(
                 f"{path} and {by_stem[path.with_suffix('')].name} would share one mask; rename one of them"
             )
-    facts = _facts(folder)
+    facts = read_facts(folder)
     if split == "validation" and "synthesized" in facts:
         raise ValueError(f"group {folder}: painted copies of one photo (gift-peft synthesize) are for training only")
     mask_class = facts.get("mask_class")
@@ -348,7 +350,8 @@ def _has_reference(folder: Path) -> bool:
         return False
 
 
-def _facts(folder: Path) -> dict:
+def read_facts(folder: Path) -> dict:
+    """What `group.yaml` says, {} without one; ValueError naming the file and what is wrong."""
     found = [folder / name for name in GROUP_FILES if (folder / name).exists()]
     if not found:
         return {}

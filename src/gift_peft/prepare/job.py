@@ -88,7 +88,7 @@ def capture_digest(capture: Capture, choices: dict) -> str:
     digest = hashlib.blake2b(stated.encode(), digest_size=16)
     files = [*capture.images, *(capture.folder / name for name in GROUP_FILES)]
     files += [path for mask in (*capture.masks, capture.common) if mask is not None for path in mask.files]
-    files += [capture.reference] if capture.reference is not None else []
+    files += [path for path in (capture.reference, capture.depth) if path is not None]
     for path in dict.fromkeys(files):
         if path.is_file():
             with path.open("rb") as file:

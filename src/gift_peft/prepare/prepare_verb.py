@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import Field, fields
 from pathlib import Path
 
-from gift_peft.captures.foreign import read_layout
+from gift_peft.captures.known_datasets import choose_layout
 from gift_peft.files import read_yaml
 from gift_peft.options import OptionParser, did_you_mean, number
 from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
@@ -75,7 +75,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     parts = {name: kind(**{key: values.pop(key) for key in _options(kind)}) for name, kind in PARTS.items()}
     choices = {key: values.pop(key) for key in _options(PrepareSettings)}
     choices["propose_masks"] |= choices["accept_proposed_masks"] or choices["refine"] is not None
-    choices["layout"] = None if choices["layout"] is None else read_layout(choices["layout"])
+    choices["layout"] = None if choices["layout"] is None else choose_layout(choices["layout"])
     return argparse.Namespace(settings=PrepareSettings(**parts, **choices), **values)
 
 

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from gift_peft.captures.foreign import Layout
+from gift_peft.captures.known_datasets import KnownLayout
 from gift_peft.captures.tree import EMPTY_MASKS
 
 
@@ -96,6 +97,11 @@ class PrepareSettings:
         | {"choices": EMPTY_MASKS},
     )
     refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
-    layout: Layout | None = field(
-        default=None, metadata=_option("YAML file that says where RGB and mask files lie", metavar="FILE")
+    layout: Layout | KnownLayout | None = field(
+        default=None,
+        metadata=_option(
+            "how RAW is laid out: booster, cleargrasp, photos (images/ and masks/), or a YAML file that says where "
+            "RGB and mask files lie",
+            metavar="NAME|FILE",
+        ),
     )

@@ -182,7 +182,9 @@ def test_an_empty_folder_says_what_is_looked_for(tmp_path, name, capsys):
 
 
 def test_a_name_that_is_nearly_right_is_guessed(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"layout boster: neither a file nor one of .*; did you mean booster\?"):
+    with pytest.raises(
+        FileNotFoundError, match=r"layout boster: neither a file nor one of .*; did you mean booster\?"
+    ):
         choose_layout("boster")
 
 

@@ -3,8 +3,9 @@
 `RAW[/train|/validation]/<group>/` holds the observations, in folders of their own if need be, their masks in any form
 that `masks.py` reads or one for all of them (`mask.*`), perhaps the treated reference (`reference.*`, `ref.*`,
 `ref_*`) and `group.yaml` (`surface`, `notes`, `mask_class`, `empty_masks`, `static_rig`; `synthesized` marks what
-`gift-peft synthesize` made). Without split folders, groups with a reference are validation and the others train.
-`GiftI` reads it as it is; `gift-peft prepare` makes a prepared folder of it.
+`gift-peft synthesize` made; `reference` is a time in a clip). Without split folders, groups with a reference are
+validation and the others train. `GiftI` reads it as it is; `gift-peft prepare` makes a prepared folder of it, and
+photos of a clip.
 """
 
 import io
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from gift_peft.captures.clip import explain_clip, find_clips, read_time
 from gift_peft.captures.folders import files_below, holds_no_photos
 from gift_peft.captures.masks import (
     MaskSource,
@@ -39,7 +41,7 @@ from gift_peft.rules import SPLITS, SURFACES, GroupPictures, check_count
 
 logger = logging.getLogger(__name__)
 
-GROUP_KEYS = {"surface", "notes", "mask_class", "empty_masks", "static_rig", "synthesized"}
+GROUP_KEYS = {"surface", "notes", "mask_class", "empty_masks", "static_rig", "synthesized", "reference"}
 GROUP_FILES = ("group.yaml", "group.yml")
 EMPTY_MASKS = ("refuse", "allow")  # a photo without a target in a group whose others have one
 REFERENCE = re.compile(r"ref(erence)?([^a-z].*)?", re.IGNORECASE)  # but not reflection_1
@@ -156,13 +158,15 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
     files = sorted(files_below(folder))
     pictures = _photos(files, folder)
     skipped = [path for path in skipped_files(files) if not is_mask_file(path, folder)]
-    references = [path for path in pictures if _is_reference(path)]
+    references = [path for path in pictures if is_reference(path)]
     if len(references) > 1:
         raise ValueError(f"group {folder}: two references, {' and '.join(path.name for path in references[:2])}")
-    if not references and (unread := [path for path in skipped if _is_reference(path)]):
+    if not references and (unread := [path for path in skipped if is_reference(path)]):
         # Left out without a word, its group would train.
         raise ValueError(f"group {folder}: the treated reference cannot be read; {name_skipped([unread[0].name])}")
     images = [path for path in pictures if path not in references]
+    if not images and (clips := find_clips(files)):
+        raise ValueError(explain_clip(folder, clips, root))
     if not images:
         told = f"; {name_skipped([path.name for path in skipped])}" if skipped else ""
         raise FileNotFoundError(f"group folder {folder} holds no images{told}")
@@ -173,6 +177,10 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
                 f"{path} and {by_stem[path.with_suffix('')].name} would share one mask; rename one of them"
             )
     facts = read_facts(folder)
+    if "reference" in facts:
+        raise ValueError(
+            f"group {folder}: `reference` in group.yaml is a time in a clip, and here are photos; remove it"
+        )
     if split == "validation" and "synthesized" in facts:
         raise ValueError(f"group {folder}: painted copies of one photo (gift-peft synthesize) are for training only")
     mask_class = facts.get("mask_class")
@@ -336,7 +344,7 @@ def _photos(files: list[Path], folder: Path) -> list[Path]:
     return sorted(photos, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 
-def _is_reference(path: Path) -> bool:
+def is_reference(path: Path) -> bool:
     return REFERENCE.fullmatch(path.stem) is not None and path.suffix != ""
 
 
@@ -345,7 +353,7 @@ def _has_reference(folder: Path) -> bool:
     try:
         files = list(files_below(folder))
         unread = skipped_files(files)  # a reference in HEIC: reading the group says what to install
-        return any(map(_is_reference, (*_photos(files, folder), *unread)))
+        return any(map(is_reference, (*_photos(files, folder), *unread))) or "reference" in read_facts(folder)
     except (OSError, ValueError):
         return False
 
@@ -370,6 +378,8 @@ def read_facts(folder: Path) -> dict:
         raise ValueError(f"{path}: empty_masks {facts['empty_masks']!r}; it is one of {', '.join(EMPTY_MASKS)}")
     if not isinstance(facts.get("static_rig", False), bool):
         raise ValueError(f"{path}: static_rig {facts['static_rig']!r}; it is true or false")
+    if "reference" in facts:
+        read_time(facts["reference"], f"{path}: reference")
     if not isinstance(facts.get("synthesized", {}), dict):
         raise ValueError(f"{path}: synthesized {facts['synthesized']!r}; it is what gift-peft synthesize wrote there")
     return facts

@@ -73,6 +73,7 @@ def _make(capture: Capture, job: Job, entry: GroupEntry, proposed_from: str) -> 
 def list_frames(capture: Capture, job: Job, entry: GroupEntry) -> None:
     """The group's facts and its pictures as the report lists them, before any is decoded."""
     notes = capture.facts.get("notes")
+    entry.warnings += job.remarks
     entry.surface, entry.notes = capture.facts.get("surface"), None if notes is None else str(notes)
     paths = [(path, "observation") for path in capture.images]
     paths += [(capture.reference, "reference")] if capture.reference is not None else []

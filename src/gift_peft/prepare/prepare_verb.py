@@ -15,7 +15,7 @@ from gift_peft.options import OptionParser, did_you_mean, number
 from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
 
 PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
-NOTES = ("one_mask", "skipped_files", "exif_turned")  # what is said at the end, beside the report
+NOTES = ("clip", "one_mask", "skipped_files", "exif_turned")  # what is said at the end, beside the report
 DESCRIPTION = """From a folder of photos to a checked GIFT-I dataset: register, check, write, report.
 
 Exit code: 0 if every group is in OUT, 3 if some were rejected (the report says why), 1 if none could be made, or RAW

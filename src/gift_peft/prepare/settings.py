@@ -97,6 +97,7 @@ class PrepareSettings:
         | {"choices": EMPTY_MASKS},
     )
     refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
+    max_frames: int = _arg("photos that are chosen of a clip, for each pose of the camera", 12, metavar="N", least=1)
     layout: Layout | KnownLayout | None = field(
         default=None,
         metadata=_option(

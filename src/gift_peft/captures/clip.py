@@ -96,8 +96,8 @@ class Clip:
         capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         if not capture.isOpened():
             raise ValueError(
-                f"{self.path}: cannot be opened as a video; a recording that was cut off, or a format that OpenCV does "
-                "not decode (convert it: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4)"
+                f"{self.path}: cannot be opened as a video; a recording that was cut off, or a format that OpenCV "
+                "does not decode (convert it: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4)"
             )
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)  # phones store upright clips lying, with a rotation beside them
         return capture

@@ -133,7 +133,7 @@ class Session:
         return " | ".join(parts)
 
     def see(self, frame: ClipFrame, typed: str | None = None) -> list[str]:
-        """Look at a frame, keep a photo if one is due, and return what is to be said. OSError: it cannot be written."""
+        """Look at a frame and keep a photo if one is due; what is to be said. OSError: the photo cannot be written."""
         said = self._listen(typed)
         self.frames, self.seconds = self.frames + 1, frame.seconds
         if self.reference_at is not None and frame.seconds >= self.reference_at:

@@ -69,7 +69,7 @@ def same_light(cells: np.ndarray, goal: np.ndarray, region: np.ndarray | None = 
 
 
 def light_gain(cells: np.ndarray, goal: np.ndarray, region: np.ndarray | None = None) -> float:
-    """By what the brightness of `cells` is multiplied to give that of `goal`, both (h, w, 3), in the median of cells."""
+    """By what the brightness of `cells` is multiplied to give that of `goal`, both (h, w, 3): the median of cells."""
     chosen = slice(None) if region is None or region.sum() < 30 else region
     here, there = cells[chosen].ravel(), goal[chosen].ravel()
     usable = (here > 8) & (here < 245) & (there > 8) & (there < 245)

@@ -99,6 +99,7 @@ class Coach:
         self._judged: Moment | None = None
         self._measured = self._last_event = 0.0
         self._moved_since: float | None = None
+        self._motion = np.eye(3)  # of the camera that was moved
 
     def ask_reference(self) -> None:
         """From now on the next still moment is the treated reference."""
@@ -124,7 +125,7 @@ class Coach:
             if ready and moment is not self._judged and not self._spoiled:
                 self._decide(seconds, moment)
         if self._moved_since is not None and seconds - self._moved_since > WAIT_AFTER_MOVING and moment is not None:
-            self._begin_group(pixels)
+            self._begin_group()
         self._hint(seconds, moment)
         return self._advice
 
@@ -146,7 +147,7 @@ class Coach:
             if drift is not None and drift > limit:
                 warnings.append(Remark("moved", f"the camera moved by {drift:.1f} px: put it back, or let it stand"))
                 self._moved_since = seconds if self._moved_since is None else self._moved_since
-                self._motion = motion
+                self._motion = motion.matrix
             elif drift is not None:
                 self._moved_since = None
             gain = light_gain(photo.cells, first.cells, self.outside)
@@ -211,8 +212,8 @@ class Coach:
             group.old_moments += 1
             self._warn_unchanged()
 
-    def _begin_group(self, pixels: np.ndarray) -> None:
-        self.matrix = self._motion.matrix @ self.matrix
+    def _begin_group(self) -> None:
+        self.matrix = self._motion @ self.matrix
         self.group, self._judged, self._moved_since = _Group(), None, None
         self._advice = Advice(still=True, new_group=True)
 

@@ -4,7 +4,6 @@
 """
 
 import math
-import os
 import shutil
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -47,8 +46,7 @@ def prepare_group(job: Job) -> Outcome:
     except Rejection as rejection:
         entry.reject(rejection.reason)
     except (OSError, ValueError, cv2.error, MemoryError, RecursionError) as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        entry.reject(Remark("unreadable", printable(text.replace(f"{job.raw}{os.sep}", ""))))
+        entry.reject(Remark("unreadable", job.readable(error)))
         digest = None  # it may be a passing trouble (permissions, memory): try again next time
     return Outcome(digest, entry.as_json(), row, proposed_from)
 
@@ -56,7 +54,10 @@ def prepare_group(job: Job) -> Outcome:
 def _make(capture: Capture, job: Job, entry: GroupEntry, proposed_from: str) -> dict:
     """The staged group's metadata row."""
     if not job.settings.propose_masks:
-        check_masks(capture)
+        try:
+            check_masks(capture)
+        except FileNotFoundError as error:
+            raise Rejection("masks_missing", job.readable(error)) from None
     photos, reference, decoded = decode(capture, job, entry)
     entry.target_frame = photos[-1].entry.name
     static = job.settings.static_rig or capture.facts.get("static_rig", False)

@@ -47,6 +47,11 @@ class Job:
         """A path below RAW as the report states it."""
         return printable(Path(os.path.relpath(path.absolute(), self.raw.absolute())).as_posix())
 
+    def readable(self, error: Exception) -> str:
+        """An error in one line, with paths relative to RAW."""
+        text = " ".join(str(error).split()) or type(error).__name__
+        return printable(text.replace(f"{self.raw}{os.sep}", ""))
+
     @property
     def group_id(self) -> str:
         if isinstance(self.source, Capture):

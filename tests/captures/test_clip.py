@@ -34,7 +34,9 @@ def numbers(frames):
     return [round((float(frame.pixels[24:, 24:].mean()) - 20) / 4) for frame in frames]
 
 
-@pytest.mark.parametrize(("name", "codec"), [("a.mp4", "mp4v"), ("a.mov", "mp4v"), ("a.avi", "MJPG"), ("a.mkv", "FFV1")])
+@pytest.mark.parametrize(
+    ("name", "codec"), [("a.mp4", "mp4v"), ("a.mov", "mp4v"), ("a.avi", "MJPG"), ("a.mkv", "FFV1")]
+)
 def test_frames_come_in_order_with_their_times(tmp_path, name, codec):
     frames = list(Clip(write(tmp_path / name, codec=codec)).frames())
     assert numbers(frames) == [frame.index for frame in frames] == list(range(30))

@@ -16,11 +16,11 @@ from gift_peft.captures.clip import Clip, ClipFrame, TimeInClip
 from gift_peft.prepare.registration import warp
 from gift_peft.prepare.still_moments import QUIET, Look, Moment, Stillness
 from gift_peft.prepare.stillness import (
-    NOISES,
     OTHER_CONTENT,
     STRUCTURE_CHANGED,
     Anchor,
     cells_inside,
+    change_above,
     difference,
 )
 
@@ -285,7 +285,7 @@ class _Scene:
 
     @property
     def _content_threshold(self) -> float:
-        return max(OTHER_CONTENT, NOISES * self.noise)
+        return change_above(self.noise, OTHER_CONTENT)
 
     def _changing(self, moments: list[_Found]) -> np.ndarray:
         """(h, w) bool: the cells that change in the pose at all; all of them where none do."""

@@ -14,11 +14,11 @@ from gift_peft.prepare.clip_frames import MOVED, OTHER_CELLS, OTHER_SHARE
 from gift_peft.prepare.entries import Remark
 from gift_peft.prepare.still_moments import LAG, QUIET, Moment, Stillness
 from gift_peft.prepare.stillness import (
-    NOISES,
     OTHER_CONTENT,
     Anchor,
     cells_inside,
     cells_of,
+    change_above,
     difference,
     light_gain,
 )
@@ -236,7 +236,7 @@ class Coach:
 
     @property
     def _content_threshold(self) -> float:
-        return max(OTHER_CONTENT, NOISES * self.watch.noise)
+        return change_above(self.watch.noise, OTHER_CONTENT)
 
     def _differs(self, photo: _Photo, other: _Photo) -> bool:
         changed = difference(photo.cells, other.cells, self.outside) > self._content_threshold

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gift_peft.prepare.stillness import MAX_CHANGE, MIN_CHANGE, NOISES, cells_of, detail_of, difference, noise_of
+from gift_peft.prepare.stillness import cells_of, change_above, detail_of, difference, noise_of
 
 LAG = 0.2  # seconds between the frames that are compared, and from a stretch's end to the frames that count
 STEP = 0.03  # seconds; of a faster stream only some frames are looked at
 QUIET = 0.4  # seconds that a still moment lasts at least
-MOVED_CELLS = 4  # that may differ in a still frame: noise has its outliers
+MOVED_CELLS = 0.0008  # share of the cells that may differ in a still frame: noise has its outliers
 DRIFT = 2.0  # grey levels within one moment, from its first frame to the others; a slow fade exceeds it
 
 
@@ -42,7 +42,8 @@ class Moment:
 class Stillness:
     """Watches a stream: `see` takes the frames in order and says when a moment has ended.
 
-    `still` says whether the last frame was, `noise` is the deviation of cells that show the same, in grey levels.
+    `still` says whether the last frame was, `noise` is what cells that show the same differ by, in grey
+    levels (`noise_of`).
     """
 
     def __init__(self) -> None:
@@ -66,7 +67,7 @@ class Stillness:
         changes = difference(look.cells, before.cells)
         self._noises.add(noise_of(changes))
         self.noise = self._noises.value
-        self.still = bool((changes > self.threshold).sum() <= MOVED_CELLS)
+        self.still = bool((changes > self.threshold).mean() <= MOVED_CELLS)
         ended = None
         if self.still and self.moment is not None and self._drifts(look.cells):
             ended, self.still = self._finish(), False
@@ -88,7 +89,7 @@ class Stillness:
     @property
     def threshold(self) -> float:
         """Grey levels above which a cell has changed from one moment to the next."""
-        return float(np.clip(NOISES * self.noise, MIN_CHANGE, MAX_CHANGE))
+        return change_above(self.noise)
 
     def _earlier(self, seconds: float) -> Look | None:
         """The latest frame that is at least LAG older; those before it are forgotten."""
@@ -99,7 +100,7 @@ class Stillness:
 
     def _drifts(self, cells: np.ndarray) -> bool:
         limit = max(DRIFT, self.threshold)
-        return bool((difference(cells, self._first) > limit).sum() > MOVED_CELLS)
+        return bool((difference(cells, self._first) > limit).mean() > MOVED_CELLS)
 
     def _count(self, look: Look, pixels: np.ndarray) -> None:
         moment = self.moment

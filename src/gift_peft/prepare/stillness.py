@@ -14,9 +14,9 @@ from gift_peft.prepare.homography import normalize_contrast, transform
 
 CELLS = 96  # along the longer side
 TRACKED_SIDE = 640  # pixels of the longer side, at which the camera's pose is measured
-MIN_CHANGE, MAX_CHANGE = 1.2, 4.0  # grey levels; bounds of what counts as a change from one moment to the next
+MIN_CHANGE, MAX_CHANGE = 1.2, 6.0  # grey levels; bounds of what counts as a change from one moment to the next
 OTHER_CONTENT = 3.0  # grey levels; moments further apart also differ by what the light does to shadows
-NOISES = 5.0  # a change exceeds the noise this many times
+NOISES = 1.9  # a change exceeds the noise this many times
 POINTS, MIN_POINTS = 300, 12
 MIN_AGREEING = 0.3  # share of the tracked points
 STRUCTURE_CHANGED = 0.6  # share of the cells that changed, above which it is another view
@@ -86,8 +86,16 @@ def difference(cells: np.ndarray, goal: np.ndarray, region: np.ndarray | None = 
 
 
 def noise_of(differences: np.ndarray) -> float:
-    """Deviation of differences (h, w) of which most are noise."""
-    return float(np.median(differences)) / 0.9  # of the largest of three half-normal values, roughly its median
+    """What 99 of 100 cells stay below, in grey levels, of differences (h, w) that are noise.
+
+    Not the median: a codec changes few cells much and most of them little.
+    """
+    return float(np.quantile(differences, 0.99))
+
+
+def change_above(noise: float, least: float = MIN_CHANGE) -> float:
+    """Grey levels above which a cell has changed, where this is the noise; `least` is what counts at all."""
+    return float(np.clip(NOISES * noise, least, max(least, MAX_CHANGE)))
 
 
 @dataclass(frozen=True)

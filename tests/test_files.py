@@ -9,7 +9,19 @@ import pytest
 from helpers.tiny import tiny_model
 
 from gift_peft import get_gift_model, load_gift_i, save_adapter
-from gift_peft.files import is_hub_id, jsonable, portable_name, read_yaml, reason, whole_folder, write_whole
+from gift_peft.files import (
+    check_inputs_stay,
+    check_replaceable,
+    is_hub_id,
+    jsonable,
+    portable_name,
+    read_yaml,
+    reason,
+    remove_files,
+    strangers,
+    whole_folder,
+    write_whole,
+)
 from gift_peft.models.convert import convert_vggt
 from gift_peft.models.identity import check_base_name
 
@@ -20,7 +32,7 @@ def test_a_folder_is_whole_or_absent(tmp_path):
         assert not target.exists()
         (folder / "inner").mkdir()
         (folder / "inner/a").write_text("old")
-    with pytest.raises(OSError, match="full"), whole_folder(target) as folder:
+    with pytest.raises(OSError, match="full"), whole_folder(target, ["inner/*"]) as folder:
         (folder / "a").write_text("new")
         raise OSError("disk full")
     assert [path.name for path in tmp_path.iterdir()] == ["target"]
@@ -32,9 +44,78 @@ def test_a_folder_replaces_the_earlier_one_and_what_a_killed_writer_left(tmp_pat
     for name in ("target", ".target.tmp", ".target.old"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "stale").write_text(name)
-    with whole_folder(target) as folder:
+    with whole_folder(target, own=["stale"]) as folder:
         (folder / "fresh").write_text("")
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["target", "target/fresh"]
+
+
+# ---- whose a file is ----
+
+
+def write(root, *names):
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(name)
+
+
+def test_a_folder_with_anything_else_in_it_is_never_replaced(tmp_path):
+    target = tmp_path / "target"
+    write(target, "data/a.bin", "notes/mine.txt")
+    (tmp_path / ".target.old").mkdir()
+    for own in ((), ["data/*"], ["notes/*.md", "data/*"]):
+        said = r"target holds files that were not written .*notes/mine\.txt"
+        with pytest.raises(ValueError, match=said), whole_folder(target, own):
+            raise AssertionError("asked before the work")
+        assert strangers(target) == ["data/a.bin", "notes/mine.txt"]
+    with pytest.raises(ValueError, match=r"late\.txt"), whole_folder(tmp_path / "new") as folder:
+        write(folder, "ours")
+        write(tmp_path, "new/late.txt")  # while we were at work
+    assert strangers(tmp_path) == ["new/late.txt", "target/data/a.bin", "target/notes/mine.txt"]
+
+
+def test_what_a_desktop_leaves_and_empty_folders_are_nobodys(tmp_path):
+    write(tmp_path, ".DS_Store", "sub/._a.png", "sub/Thumbs.db")
+    (tmp_path / "sub/empty").mkdir()
+    check_replaceable(tmp_path)
+    write(tmp_path, ".hidden")
+    with pytest.raises(ValueError, match=r"\(\.hidden\)"):
+        check_replaceable(tmp_path)
+    with pytest.raises(OSError, match="hidden exists and is no folder"):
+        check_replaceable(tmp_path / ".hidden")
+    (tmp_path / ".hidden").unlink()
+    (tmp_path / "sub/link").symlink_to(tmp_path.parent)  # a folder elsewhere: named, not entered
+    assert strangers(tmp_path) == ["sub/link"]
+
+
+def test_a_link_to_a_folder_stays_a_link(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "disk")
+    with whole_folder(tmp_path / "link") as folder:
+        write(folder, "a")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "disk/a").read_text() == "a"
+
+
+def test_files_are_removed_with_the_folders_that_they_leave_empty(tmp_path):
+    write(tmp_path, "a/b/1", "a/b/2", "a/c/1", "d/1")
+    remove_files(tmp_path, ["a/b/1", "a/b/2", "d/1", "gone/1"])
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["a", "a/c", "a/c/1"]
+
+
+def test_an_output_never_is_an_input(tmp_path):
+    photos = tmp_path / "photos"
+    write(photos, "Kitchen.PNG", "caf\u00e9.png")
+    (tmp_path / "linked").symlink_to(photos)
+    (tmp_path / "alias.png").symlink_to(photos / "Kitchen.PNG")
+    os.link(photos / "Kitchen.PNG", tmp_path / "hard.png")
+    inputs = [photos / "Kitchen.PNG", photos / "caf\u00e9.png"]
+    same = [photos / "kitchen.png", photos / "cafe\u0301.png", tmp_path / "linked/KITCHEN.png"]
+    same += [tmp_path / "alias.png", tmp_path / "hard.png", photos / "../photos/Kitchen.PNG"]
+    for path in same:
+        with pytest.raises(ValueError, match=r"would replace the input .*photos"):
+            check_inputs_stay([tmp_path / "other.png", path], inputs)
+    with pytest.raises(ValueError, match="would replace the input"):  # an input that is a link: the link stays too
+        check_inputs_stay([tmp_path / "ALIAS.png"], [tmp_path / "alias.png"])
+    check_inputs_stay([photos / "kitchen.npy", tmp_path / "Photos/Kitchen.PNG", tmp_path / "new/kitchen.png"], inputs)
 
 
 def test_a_folder_is_never_seen_half_deleted(tmp_path, monkeypatch):

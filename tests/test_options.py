@@ -7,11 +7,12 @@ import subprocess
 import sys
 import warnings
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 
 from gift_peft.cli import VERBS
-from gift_peft.options import OptionParser, run_verb
+from gift_peft.options import OptionParser, expand_home, run_verb
 from gift_peft.training import arguments
 
 SYNONYMS = {
@@ -131,6 +132,29 @@ def test_what_follows_two_hyphens_is_taken_as_it_is():
     parser.add_argument("files", nargs="+")
     args = parser.parse_args(["--out_dir=a_b", "--", "--x_y.jpg", "x_y"])
     assert (args.out_dir, args.files) == ("a_b", ["--x_y.jpg", "x_y"])
+
+
+def test_the_home_folder_is_written_out_in_every_option(parser, monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    tried = 0
+    for option, action in options(parser):
+        if action.choices or action.type not in (None, str, Path) or action.nargs == 0:
+            continue
+        for other in parser._actions:
+            other.required, other.default = False, argparse.SUPPRESS
+            if not other.option_strings:
+                other.nargs, other.choices = "*", None
+        value = vars(parser.parse_args([f"{option}=~/x y"]))[action.dest]
+        assert value in (f"{tmp_path}/x y", [f"{tmp_path}/x y"], Path(f"{tmp_path}/x y")), option
+        tried += 1
+    assert tried or parser.prog == "gift-peft synthesize"  # which has numbers alone
+
+
+def test_only_a_leading_tilde_is_the_home_folder(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    words = ["~", "~/a", "a~", "/x/~/y", "~nobody-has-this-name/x", "", Path("~/a"), ["~/a", 3], None, 1.5]
+    expected = ["/home/me", "/home/me/a", "a~", "/x/~/y", "~nobody-has-this-name/x", "", Path("/home/me/a")]
+    assert expand_home(words) == [*expected, ["/home/me/a", 3], None, 1.5]
 
 
 def test_a_misspelled_option_is_told_with_the_nearest(parser, monkeypatch):

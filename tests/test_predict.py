@@ -17,7 +17,7 @@ from gift_peft.adapters.recipes import RECIPES, get_gift_model
 from gift_peft.colormap import GREY, color_range, colorize
 from gift_peft.models.identity import teacher_revision
 from gift_peft.models.loading import DepthModel
-from gift_peft.predict import predict_images
+from gift_peft.predict import PicturesWithoutDepth, predict_images, run
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,63 @@ def test_exif_orientation_decides_the_size(base_dir, photo, tmp_path):
     assert np.load(path).shape == (61, 45)
 
 
+# ---- what is the user's stays ----
+
+
+def pictures(folder, source, *names):
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        Image.open(source).save(folder / name)
+    return folder
+
+
+@pytest.mark.parametrize("way", ["folder", "link", "case"])
+def test_a_photo_is_never_replaced(way, base_dir, photo, tmp_path, monkeypatch):
+    folder = pictures(tmp_path / "photos", photo, "Hall.PNG" if way == "case" else "hall.png", "bath.jpg")
+    (tmp_path / "link").symlink_to(folder)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    monkeypatch.setattr(DepthModel, "from_pretrained", lambda *given: pytest.fail("told before a model is loaded"))
+    with pytest.raises(ValueError, match=r"(?i)all\.png would replace the input .*/hall\.png"):
+        predict_images([folder], base_dir, out=tmp_path / "link" if way == "link" else folder, size=SIZE)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_only_what_predict_wrote_is_replaced(base_dir, photo, tmp_path):
+    out = pictures(tmp_path / "out", photo, "photo.png")
+    for name, size in (("photo.png", (45, 61)), ("photo.npy", (45, 61))):
+        if name.endswith("npy"):
+            (out / "photo.png").unlink()
+            np.save(out / name, np.zeros(size, np.float32))
+        before = (out / name).read_bytes()
+        with pytest.raises(ValueError, match=rf"{name} was not written by gift-peft predict and is kept"):
+            predict_images([photo], base_dir, out=out, size=SIZE)
+        assert (out / name).read_bytes() == before
+    (out / "photo.npy").unlink()
+    (path,) = predict_images([photo], base_dir, out=out, size=SIZE)
+    first = path.read_bytes()
+    path.unlink()  # as a run that was killed between the two
+    assert predict_images([photo], base_dir, out=out, size=SIZE)[0].read_bytes() == first
+    assert predict_images([photo], base_dir, out=out, size=SIZE)[0].read_bytes() == first
+
+
 # ---- bad input ----
+
+
+def test_one_bad_picture_does_not_end_a_batch(base_dir, photo, tmp_path, capsys):
+    folder = pictures(tmp_path / "photos", photo, "a.png", "b.png", "d.png")
+    (folder / "b.png").write_bytes(b"<html>")
+    (folder / "c.jpg").write_bytes(photo.read_bytes()[:300])
+    argv = [str(folder), "--base", str(base_dir), "--out", str(tmp_path / "out"), "--size", "56x70"]
+    assert run(argv) == 1
+    printed = capsys.readouterr()
+    assert printed.out == f"Depth maps written to {tmp_path / 'out'}: 2\n"
+    *lines, last = [line for line in printed.err.splitlines() if line.startswith("gift-peft: ")]
+    assert len(lines) == 2 and f"{folder}/b.png: " in lines[0] and f"{folder}/c.jpg: " in lines[1]
+    assert last == "gift-peft: 2 of 4 pictures have no depth"
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.npy", "a.png", "d.npy", "d.png"]
+    with pytest.raises(PicturesWithoutDepth, match=r"2 of 4 pictures have no depth: .*b\.png.*c\.jpg") as error:
+        predict_images([folder], base_dir, out=tmp_path / "out", size=SIZE)
+    assert [path.name for path in error.value.paths] == ["a.npy", "d.npy"]
 
 
 def test_missing_things_are_named(base_dir, adapter_dir, photo, tmp_path):
@@ -159,11 +215,11 @@ def test_unreadable_pictures_are_named(base_dir, photo, tmp_path):
 
 def test_an_adapter_for_other_weights_is_refused(adapter_dir, base_dir, tmp_path):
     other = write_base(tmp_path / "other", seed=1)
-    with pytest.raises(ValueError, match=r"adapter .* was trained on .*, whose files are not those of base .*other"):
+    with pytest.raises(ValueError, match=r"adapter .* was trained on .*, whose weights are not those of base .*other"):
         DepthModel.from_pretrained(other, adapter_dir)
     plain = shutil.copytree(adapter_dir, tmp_path / "plain")
     (plain / "gift.json").unlink()  # as PEFT alone saves: the folder it names still tells
-    with pytest.raises(ValueError, match=r"whose files are not those of base .*other"):
+    with pytest.raises(ValueError, match=r"whose weights are not those of base .*other"):
         DepthModel.from_pretrained(other, plain)
     assert DepthModel.from_pretrained(base_dir, plain).size == SIZE
     moved = shutil.copytree(base_dir, tmp_path / "moved")
@@ -189,16 +245,16 @@ def test_an_adapter_for_other_shapes_or_layers_is_refused(adapter_dir, base_dir,
 
 
 def test_an_adapter_of_another_hub_id_is_refused(adapter_dir, base_dir, tmp_path, monkeypatch):
-    from gift_peft.models import loading
+    from gift_peft.models import adapter_base
 
     hub = shutil.copytree(adapter_dir, tmp_path / "hub")
     config = json.loads((hub / "adapter_config.json").read_text())
     (hub / "adapter_config.json").write_text(json.dumps(config | {"base_model_name_or_path": "org/model-a"}))
     (hub / "gift.json").write_text(json.dumps({"base_revision": "0123abc"}))
-    monkeypatch.setattr(loading, "teacher_revision", lambda base, revision: "4567def")
-    with pytest.raises(ValueError, match=r"was trained on org/model-a, not on base org/model-b"):
-        loading._check_base("org/model-b", None, hub, "org/model-a")
-    loading._check_base("org/model-a", None, hub, "org/model-a")
+    monkeypatch.setattr(adapter_base, "teacher_revision", lambda base, revision: "4567def")
+    with pytest.raises(ValueError, match=r"trained on org/model-a, whose .* base org/model-b: it is another model on"):
+        adapter_base.check_base("org/model-b", None, hub, "org/model-a", accept=False)
+    adapter_base.check_base("org/model-a", None, hub, "org/model-a", accept=False)
     monkeypatch.undo()
     assert DepthModel.from_pretrained(base_dir, hub).size == SIZE  # a local copy of the hub's model
 
@@ -243,7 +299,7 @@ def test_a_full_disk_names_the_file_and_leaves_nothing(base_dir, photo, tmp_path
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("gift_peft.files.os.fsync", full)
-    with pytest.raises(OSError, match=r"No space left.*photo\.npy"):
+    with pytest.raises(OSError, match=r"No space left.*photo\.png"):
         predict_images([photo], base_dir, out=tmp_path / "out", size=SIZE)
     assert list((tmp_path / "out").iterdir()) == []
 

@@ -1,13 +1,16 @@
 """Files and folders that are whole or absent, whenever their writer is killed; small files read with clear errors.
 
-And what a name of a model or dataset means: on the Hub, or a path here.
+Whose a file is: no verb replaces or deletes what it did not write, or writes over what it reads. And what a name of a
+model or dataset means: on the Hub, or a path here.
 """
 
 import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import unicodedata
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ LEFTOVERS = {
     "__pycache__",
 }  # fmt: skip
 _OPENS_FOLDERS = os.name != "nt"  # Windows does not, so there only files are synced
+_DESKTOP = (".DS_Store", "._*", "Thumbs.db", "desktop.ini")  # what file managers leave in every folder
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
@@ -51,13 +55,16 @@ def write_whole(path: Path, content: bytes | str) -> None:
 
 
 @contextmanager
-def whole_folder(target: Path) -> Iterator[Path]:
+def whole_folder(target: Path, own: Collection[str] = ()) -> Iterator[Path]:
     """A temporary folder beside `target`, which takes its name and place when the block ends without an error.
 
-    What was at `target` goes as a whole; after an error it is untouched and the temporary folder is deleted. Contents
-    reach the disk before the name does. A killed writer leaves `.<name>.tmp` or, for the blink of an eye, the old
-    folder as `.<name>.old`; the next one tidies up.
+    What was at `target` goes as a whole, if `check_replaceable(target, own)` allows it; that is asked at both ends.
+    After an error it is untouched and the temporary folder is deleted. Contents reach the disk before the name does.
+    A killed writer leaves `.<name>.tmp` or, for the blink of an eye, the old folder as `.<name>.old`; the next one
+    tidies up. A link to a folder stays one.
     """
+    check_replaceable(target, own)
+    target = Path(os.path.realpath(target))
     temporary, old = target.with_name(f".{target.name}.tmp"), target.with_name(f".{target.name}.old")
     for folder in (temporary, old):
         shutil.rmtree(folder, ignore_errors=True)
@@ -66,6 +73,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
         yield temporary
         for path in [*temporary.rglob("*"), temporary]:
             _sync(path)
+        check_replaceable(target, own)  # again: the block took its time
         if target.exists():
             os.replace(target, old)
         os.replace(temporary, target)
@@ -84,11 +92,89 @@ def remove_folder(folder: Path) -> None:
     shutil.rmtree(gone)
 
 
+# ---- whose a file is ----
+
+
+def strangers(folder: Path, own: Collection[str] = ()) -> list[str]:
+    """The files of a folder that match none of the patterns `own`, by their names in it, sorted; of no folder none.
+
+    Patterns are those of `fnmatch` on names such as `data/a.png`; a `*` also stands for several parts of such a name.
+    What file managers leave in every folder does not count.
+    """
+
+    def unreadable(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError):
+            raise error
+
+    found: list[str] = []
+    for place, folders, files in os.walk(folder, onerror=unreadable):
+        linked = [name for name in folders if os.path.islink(os.path.join(place, name))]
+        names = [name for name in files + linked if not any(fnmatchcase(name, pattern) for pattern in _DESKTOP)]
+        found += [Path(os.path.relpath(os.path.join(place, name), folder)).as_posix() for name in names]
+    return sorted(name for name in found if not any(fnmatchcase(name, pattern) for pattern in own))
+
+
+def check_replaceable(folder: Path, own: Collection[str] = ()) -> None:
+    """Raise ValueError unless a folder may be replaced or deleted as a whole.
+
+    It may if it is absent, empty, or holds only files that match the patterns `own` (as `strangers` reads them): those
+    that the caller writes.
+    """
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise NotADirectoryError(f"{folder} exists and is no folder: name another one")
+    if others := strangers(folder, own):
+        listed = ", ".join(others[:3]) + (f" and {len(others) - 3} more" if len(others) > 3 else "")
+        raise ValueError(
+            f"{folder} holds files that were not written by this command ({listed}): they are kept; "
+            "name another folder, or move them away"
+        )
+
+
+def remove_files(root: Path, names: Iterable[str]) -> None:
+    """Delete these files below `root`, and the folders there that are empty then; what is gone already is no error."""
+    for name in names:
+        path = root / name
+        path.unlink(missing_ok=True)
+        for folder in path.relative_to(root).parents:
+            try:
+                (root / folder).rmdir() if folder.name else None
+            except OSError:
+                break  # it holds something else, or is gone
+
+
+def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """Raise ValueError if a file to be written is one that is read: the same one, also through links, or one whose
+    name differs in case or in the composition of accents alone, which is the same on many disks."""
+    read = {key: path for path in inputs for key in _places(path)}
+    for path in outputs:
+        for key in _places(path):
+            if key in read:
+                raise ValueError(f"{path} would replace the input {read[key]}: choose another place for the output")
+
+
+def _places(path: Path) -> list[tuple]:
+    """What a path names: a folder and a name in it, as it is written and after links, and the file itself."""
+    keys: list[tuple] = []
+    for place in (path, Path(os.path.realpath(path))):
+        folder = os.path.realpath(place.parent)
+        try:
+            at: Any = (os.stat(folder).st_dev, os.stat(folder).st_ino)
+        except OSError:
+            at = folder
+        keys.append((at, unicodedata.normalize("NFC", place.name.casefold())))
+    with suppress(OSError):
+        keys.append((os.stat(path).st_dev, os.stat(path).st_ino))
+    return keys
+
+
 def is_leftover(name: str) -> bool:
     """Whether a file or folder of this name is passed over wherever a person's files are listed: hidden ones
     (`.DS_Store`, `._photo.jpg`, `.AppleDouble`), and those of `LEFTOVERS`.
     """
     return name.startswith(".") or name.casefold() in LEFTOVERS
+
+
+# ---- small files ----
 
 
 def read_yaml(path: Path, name: str | None = None) -> dict:
@@ -134,6 +220,18 @@ def is_hub_id(name: str | Path) -> bool:
     except ValueError:
         return False
     return not Path(name).exists()
+
+
+def locate(name: str | Path, beside: Path) -> Path | None:
+    """A file or folder that was named elsewhere, or None: as it is named from here, else from `beside` or a folder
+    above it, else by its last part in `beside` (or next to it, for what can be no hub id)."""
+    path = Path(os.path.expanduser(name))
+    if path.exists():
+        return path
+    beside = Path(os.path.realpath(beside))
+    places = [] if path.is_absolute() else [folder / path for folder in (beside, *beside.parents)]
+    places += [beside / path.name, *([] if is_hub_id(name) else [beside.parent / path.name])]
+    return next((place for place in places if path.name and place.exists()), None)
 
 
 def portable_name(name: str | Path) -> str:

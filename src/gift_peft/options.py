@@ -13,6 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from importlib import metadata
+from typing import Any
 
 
 class OptionParser(argparse.ArgumentParser):
@@ -56,7 +57,10 @@ class OptionParser(argparse.ArgumentParser):
     def parse_known_args(self, args=None, namespace=None):
         words = list(sys.argv[1:] if args is None else args)
         options = before_separator(words)
-        return super().parse_known_args([*map(_hyphens, options), *words[len(options) :]], namespace)
+        values, rest = super().parse_known_args([*map(_hyphens, options), *words[len(options) :]], namespace)
+        for name, value in vars(values).items():
+            setattr(values, name, expand_home(value))
+        return values, rest
 
 
 class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
@@ -67,6 +71,18 @@ class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescrip
             action = copy.copy(action)
             action.default = argparse.SUPPRESS
         super().add_argument(action)
+
+
+def expand_home(value: Any) -> Any:
+    """A path that begins with `~`, or a list of such, with the home folder in its place; anything else as it is.
+
+    A shell does that for words of their own, but neither in `--out=~/run` nor in a YAML file.
+    """
+    if isinstance(value, list):
+        return [expand_home(item) for item in value]
+    if isinstance(value, str | os.PathLike) and os.fspath(value).startswith("~"):
+        return type(value)(os.path.expanduser(value))
+    return value
 
 
 def before_separator(words: Sequence[str]) -> Sequence[str]:
@@ -104,6 +120,8 @@ def add_dataset(parser: argparse.ArgumentParser, required: bool = True) -> None:
 def add_adapter(parser: argparse.ArgumentParser) -> None:
     """The options that put an adapter on the base."""
     parser.add_argument("--adapter", metavar="ID", help="adapter: hub id or folder")
+    text = "take the base although the adapter was trained on other weights"
+    parser.add_argument("--accept-base", action="store_true", help=text)
     parser.add_argument("--adapter-scale", type=float, metavar="S", help="0 is the base, 1 the adapter")
     parser.add_argument("--kind", choices=["depth", "inverse_depth"], help="what is predicted, if no recipe says it")
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # torch takes longer to import than the command line takes to
 SPLITS = ("train", "validation")
 SURFACES = ["mirror", "transparent"]
 KINDS = ("depth", "inverse_depth")  # what a model predicts
+MAX_GROUP_ID = 210  # bytes; the names of a group's files are longer, and file systems take 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,3 +145,7 @@ def check_group_id(group_id: str) -> None:
     """Raise ValueError unless a group's id can name a folder and a proxy file."""
     if not group_id or group_id.startswith(".") or re.search(r'[/\\:*?"<>|\0]', group_id):
         raise ValueError(f"group id {group_id!r}: it names a folder, so no separators and no leading dot")
+    if (length := len(group_id.encode(errors="surrogateescape"))) > MAX_GROUP_ID:
+        raise ValueError(
+            f"group {group_id[:40]}...: its name has {length} bytes, at most {MAX_GROUP_ID} can be; rename it"
+        )

@@ -178,7 +178,7 @@ def test_saving_replaces_the_whole_folder(model, tmp_path):
     assert torch.equal(depth(PeftModel.from_pretrained(tiny_model(), folder).eval()), first)
 
     (folder / "photo.jpg").touch()
-    with pytest.raises(ValueError, match=r"holds files that are no adapter's \(photo.jpg\)"):
+    with pytest.raises(ValueError, match=r"holds files that were not written by this command \(photo.jpg\)"):
         save_adapter(model, folder, "someone/base")
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError, match="file"):

@@ -3,11 +3,16 @@
 import pytest
 import torch
 from helpers.adapted import PIXELS, depth, trained
-from helpers.tiny import tiny_model
-from peft import LoraConfig, get_peft_model
+from helpers.tiny import tiny_model, write_base
+from peft import LoraConfig, PeftModel, get_peft_model
+from transformers import AutoModelForDepthEstimation
 
+from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import HEADS, get_gift_model
-from gift_peft.adapters.scale import set_adapter_scale
+from gift_peft.adapters.scale import active_lora, active_saved_modules, set_adapter_scale
+
+# transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
+pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
 
 
 @pytest.mark.parametrize("head", HEADS)
@@ -48,6 +53,49 @@ def test_scale_then_merge(model):
     set_adapter_scale(model, 0.5)
     scaled = depth(model, pixels)
     torch.testing.assert_close(depth(model.merge_and_unload(), pixels), scaled, rtol=1e-10, atol=1e-10)
+
+
+@pytest.fixture
+def adapter_folder(tmp_path):
+    """An adapter whose head was trained in full, and its base."""
+    write_base(tmp_path / "base")
+    with pytest.warns(UserWarning, match="local folder"):
+        save_adapter(trained(get_gift_model(tiny_model())), tmp_path / "adapter", str(tmp_path / "base"))
+    return tmp_path / "adapter"
+
+
+def test_transformers_own_switch_leaves_the_head_off(adapter_folder):
+    """What upstream does: if this fails, `enable_adapters` is mended there, and card and docs may say so."""
+    model = AutoModelForDepthEstimation.from_pretrained(adapter_folder).eval()
+    adapted = depth(model)
+    model.disable_adapters()
+    assert torch.equal(depth(model), depth(tiny_model()))
+    model.enable_adapters()
+    assert not torch.equal(depth(model), adapted)
+    assert {wrapper.disable_adapters for wrapper, _ in active_saved_modules(model)} == {True}
+    assert {layer.disable_adapters for layer, _ in active_lora(model)} == {False}
+
+
+@pytest.mark.parametrize("way", ["off", "off and on", "head off", "lora off", "peft"])
+def test_setting_the_scale_switches_everything_on(way, adapter_folder):
+    if way == "peft":
+        model = PeftModel.from_pretrained(tiny_model(), adapter_folder).eval()
+        adapted = depth(model)
+        model.base_model.disable_adapter_layers()
+    else:
+        model = AutoModelForDepthEstimation.from_pretrained(adapter_folder).eval()
+        adapted = depth(model)
+        if way.startswith("off"):
+            model.disable_adapters()
+        if way == "off and on":
+            model.enable_adapters()
+        parts = {"head off": active_saved_modules, "lora off": active_lora}.get(way, lambda model: [])(model)
+        for module, _ in parts:
+            module.enable_adapters(False)
+    assert not torch.equal(depth(model), adapted)
+    for scale, expected in ((1, adapted), (0, depth(tiny_model())), (1, adapted)):
+        set_adapter_scale(model, scale)
+        assert torch.equal(depth(model), expected)
 
 
 def test_scale_refusals(model):

@@ -86,12 +86,14 @@ def test_the_message_names_what_was_seen(raw):
     (raw / "train/hall/x.json").write_text(json.dumps(many("7.jpg", "8.jpg")))
     (raw / "all.json").write_text(json.dumps(many("1.jpg", "cup/1.jpg", "cup/2.jpg")))
     (raw / "camera.json").write_text('{"fx": 600}')
+    (raw / "annotations.xml").write_text("<annotations/>")
     with pytest.raises(FileNotFoundError) as error:
         list_groups(raw)
     text = str(error.value)
     assert text.startswith(f"missing mask {raw}/train/hall/masks/1.png for the image 1.jpg; ")
     assert f"{raw}/train/hall/x.json (COCO, 2 images) does not list 1.jpg" in text
     assert f"{raw}/all.json (COCO) lists 1.jpg, a name that 2 photos below {raw} have; call it hall/1.jpg" in text
+    assert f"{raw}/annotations.xml is not read (export as COCO, or as masks)" in text
     assert "--propose-masks" in text and "camera" not in text and "\n" not in text
 
 
@@ -102,6 +104,13 @@ def test_photos_that_were_converted(raw, name):
     assert look(raw, "cup/2.jpg") is None
     (raw / "train/cup/x.json").write_text(json.dumps(many(name, "1.tif")))
     with pytest.raises(ValueError, match=r"may both mean 1\.jpg"):
+        look(raw, "cup/1.jpg")
+
+
+def test_the_short_form_of_label_studio_is_refused(raw):
+    short = [{"image": "/data/upload/1/0a1b2c3d-1.jpg", "id": 1, "annotation_id": 2, "label": [{"points": CORNERS}]}]
+    (raw / "train/cup/x.json").write_text(json.dumps(short))
+    with pytest.raises(ValueError, match=r"x\.json: Label Studio's short form \(JSON-MIN\)"):
         look(raw, "cup/1.jpg")
 
 

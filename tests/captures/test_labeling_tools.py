@@ -1,4 +1,4 @@
-"""What labelme, COCO and Label Studio files mean where tools and people differ: turned boxes, holes, odd ids, leftovers."""
+"""labelme, COCO and Label Studio where tools and people differ: turned boxes, holes, odd ids, leftovers."""
 
 import copy
 import math
@@ -171,7 +171,7 @@ def test_a_click_beside_shapes_is_passed_over():
         np.testing.assert_array_equal(read_labelme(shapes(leftover, ("glass", CORNERS)), SIZE, None), BOX)
         with pytest.raises(ValueError, match="has no area"):
             read_labelme(shapes(leftover), SIZE, None)
-    with pytest.raises(ValueError, match="type 'linestrip' .* has no area"):  # an outline that was never closed
+    with pytest.raises(ValueError, match=r"type 'linestrip' .* has no area"):  # an outline that was never closed
         read_labelme(shapes(("glass", CORNERS), ("glass", HOLE, "linestrip")), SIZE, None)
 
 

@@ -1,6 +1,7 @@
 """Masks as programs save them: palettes, grey in color channels, transparency, JPEG, and names that nearly fit."""
 
 import io
+import json
 import unicodedata
 
 import numpy as np
@@ -38,7 +39,7 @@ def indexed(mask, colors, numbers=(0, 1)) -> Image.Image:
 BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 
-@given(mask=arrays(bool, (5, 7)), numbers=st.permutations(range(256)).map(lambda order: order[:2]))
+@given(mask=arrays(bool, (5, 7)), numbers=st.lists(st.integers(0, 255), min_size=2, max_size=2, unique=True))
 @settings(max_examples=40)
 def test_a_palette_is_read_by_its_colors_whatever_their_order(mask, numbers):
     for kind in ("PNG", "GIF"):
@@ -195,7 +196,7 @@ def test_accents_composed_or_not(group, forms, suffix):
     Image.new("RGB", SIZE).save(group / f"{photo}.jpg")
     path = group / "masks" / (mask + ("." if suffix[0] != "_" else "") + suffix)
     if suffix == "json":
-        path.write_text('{"shapes": [], "imagePath": "../%s.jpg"}' % mask)
+        path.write_text(json.dumps({"shapes": [], "imagePath": f"../{mask}.jpg"}))
     else:
         GREY.save(path)
     assert find_mask(group / f"{photo}.jpg", group, group.parents[1]).path == path

@@ -140,7 +140,7 @@ def test_refusals(tmp_path):
     source = prepared(tmp_path)
     (tmp_path / "used").mkdir()
     (tmp_path / "used/file").touch()
-    for folder, message in (("used", "is not an empty folder"), ("prepared/release", "is inside")):
+    for folder, message in (("used", "holds files that were not written"), ("prepared/release", "is inside")):
         with pytest.raises(ValueError, match=message):
             export_parquet(source, tmp_path / folder)
     for size in ("0MB", "many", "-1", "5 TBs", "nan", "1e999"):

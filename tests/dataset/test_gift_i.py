@@ -323,3 +323,31 @@ def test_cleargrasp_as_validation_groups(tmp_path):
         assert np.array_equal(np.asarray(row["depths"][0]), depth) and depth.max() > 300
         assert 0.001 < (np.asarray(row["masks"][0]) == 255).mean() < 0.5
         assert row["reference"].size == (1280, 720)
+
+
+def test_saved_to_disk_and_loaded_again(raw_tree, base_dir, tmp_path):
+    make_proxies(base_dir, raw_tree, size=SIZE)
+    rows = load_gift_i(raw_tree, "train", teacher=base_dir)
+    expected = list(rows)
+    rows.save_to_disk(tmp_path / "one")
+    both = datasets.DatasetDict({split: load_gift_i(raw_tree, split) for split in ("train", "validation")})
+    both.save_to_disk(tmp_path / "both")
+    names = dict(zip(rows["group_id"], rows["image_names"], strict=True))
+    kept = datasets.load_from_disk(tmp_path / "one")  # with its proxies
+    assert torch.equal(kept[0]["proxies"], expected[0]["proxies"])
+    shutil.move(raw_tree / "train", tmp_path / "gone")  # the pictures are in it
+    for folder, splits in ((tmp_path / "one", ["train"]), (tmp_path / "both", ["train", "validation"])):
+        assert gift_i_splits(folder) == splits
+        again = load_gift_i(folder, "train")
+        assert dict(zip(again["group_id"], again["image_names"], strict=True)) == names
+        for row, before in zip(again, expected, strict=True):
+            for column in ("images", "masks"):
+                assert all(np.array_equal(a, b) for a, b in zip(row[column], before[column], strict=True))
+        assert load_gift_i(folder, "train[1:]")["group_id"][:] == rows["group_id"][1:]
+    make_proxies(base_dir, tmp_path / "both", size=SIZE)
+    assert torch.equal(load_gift_i(tmp_path / "both", "train", teacher=base_dir)[1]["proxies"], expected[1]["proxies"])
+    with pytest.raises(ValueError, match="no split 'validation', only train"):
+        load_gift_i(tmp_path / "one", "validation")
+    datasets.Dataset.from_dict({"a": [1]}, split="train").save_to_disk(tmp_path / "other")
+    with pytest.raises(ValueError, match="it lacks the column "):
+        load_gift_i(tmp_path / "other", "train")

@@ -32,7 +32,7 @@ def deep(path):
 
 
 DAMAGE = {
-    "missing mask": (lambda g: (g / "masks/1.png").unlink(), "masks/1.png", "missing mask"),
+    "missing masks": (lambda g: [path.unlink() for path in g.glob("masks/*")], "masks/0.png", "missing mask"),
     "mask of another size": (lambda g: save_mask(g / "masks/1.png", np.ones((50, 80))), "1.png", "50x80"),
     "truncated": (lambda g: cut(g / "1.png"), "1.png", "truncated"),
     "unreadable": (lambda g: (g / "0.png").write_text("hello"), "0.png", "not a readable image"),

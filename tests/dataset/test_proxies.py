@@ -14,7 +14,7 @@ from helpers.tiny import SIZE, tiny_model, tiny_processor, write_base
 from PIL import Image
 
 from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.dataset.proxies import default_proxies_dir, read_header, write_proxies
+from gift_peft.dataset.proxies import SurfaceSettings, default_proxies_dir, read_header, write_proxies
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.models import loading
 from gift_peft.models.identity import teacher_id, teacher_revision
@@ -87,19 +87,73 @@ def test_other_weights_under_the_same_path_are_detected(raw_tree, base_dir, tmp_
     ):
         with pytest.raises(ValueError) as excinfo:
             use()
-        one_line(excinfo, f"stale proxy {folder / 'train/scene_0.safetensors'}", "model or revision sha256:")
+        one_line(excinfo, f"stale proxy {folder / 'train/scene_0.safetensors'}", "model or revision tensors:")
+
+
+def test_sets_of_several_sizes_lie_side_by_side(raw_tree, base_dir):
+    small = make_proxies(base_dir, raw_tree, size=SIZE)
+    before = {path: path.read_bytes() for path in small.rglob("*.safetensors")}
+    large = make_proxies(base_dir, raw_tree, size="56x84")
+    teacher_folder = raw_tree / "proxies" / base_dir.name
+    assert (small, large) == (teacher_folder / "56x70", teacher_folder / "56x84")
+    assert {path: path.read_bytes() for path in small.rglob("*.safetensors")} == before
+    for size in (SIZE, (56, 84)):
+        assert load_gift_i(raw_tree, "train", teacher=base_dir, size=size)[0]["proxies"].shape == (2, *size)
+    with pytest.raises(ValueError) as excinfo:  # none is guessed
+        load_gift_i(raw_tree, "train", teacher=base_dir)
+    one_line(excinfo, "at 56x70 and 56x84: give the size")
+    with pytest.raises(FileNotFoundError) as excinfo:
+        load_gift_i(raw_tree, "train", teacher=base_dir, size=(28, 42))[0]
+    one_line(excinfo, "missing proxy", "28x42/train/scene_0.safetensors", "--size 28x42`")
+
+
+def as_before(folder):
+    """The set where 0.1.0 had it, without its size in the path."""
+    for split in ("train", "validation"):
+        shutil.move(folder / split, folder.parent / split)
+    folder.rmdir()
+    return folder.parent
+
+
+def test_a_set_of_an_earlier_version_is_read_and_kept(raw_tree, base_dir):
+    settings = SurfaceSettings(fills=1)
+    folder = make_proxies(base_dir, raw_tree, size=SIZE, surface=settings)
+    new = load_gift_i(raw_tree, "train", teacher=base_dir, surface=settings)[1]
+    old = as_before(folder)
+    files = {path: path.read_bytes() for path in old.rglob("*.safetensors")}
+    for size in (None, SIZE):
+        row = load_gift_i(raw_tree, "train", teacher=base_dir, size=size, surface=settings)[1]
+        assert all(
+            torch.equal(row[name], new[name]) for name in ("proxies", "surface_target", "surface_target_flipped")
+        )
+    make_proxies(base_dir, raw_tree, size=SIZE, surface=settings)
+    assert {path: path.read_bytes() for path in old.rglob("*.safetensors")} == files  # nothing to do
+    make_proxies(base_dir, raw_tree, size="56x84", surface=settings)  # it is not stale for being of another size
+    assert load_gift_i(raw_tree, "train", teacher=base_dir, size=(56, 84))[0]["proxies"].shape == (2, 56, 84)
+    repaint(raw_tree)
+    with pytest.raises(ValueError) as excinfo:
+        make_proxies(base_dir, raw_tree, size=SIZE)
+    one_line(excinfo, f"stale proxy {old / 'validation/scene_100.safetensors'}", "--overwrite")
+    make_proxies(base_dir, raw_tree, size=SIZE, overwrite=True)
+    assert load_gift_i(raw_tree, "validation", teacher=base_dir, size=SIZE)[0]["proxies"].shape == (2, *SIZE)
+    assert all(
+        path.read_bytes() == content for path, content in files.items()
+    )  # the new set is used, the old one kept
+
+
+def test_an_earlier_set_that_is_damaged_is_as_none(raw_tree, base_dir):
+    old = as_before(make_proxies(base_dir, raw_tree, size=SIZE))
+    for path in old.rglob("*.safetensors"):
+        path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(FileNotFoundError, match=r"missing proxy .*56x70"):
+        load_gift_i(raw_tree, "train", teacher=base_dir, size=SIZE)[0]
+    make_proxies(base_dir, raw_tree, size=SIZE)
+    assert load_gift_i(raw_tree, "train", teacher=base_dir)[0]["proxies"].shape == (2, *SIZE)
 
 
 def test_other_size_or_processor(raw_tree, base_dir, tmp_path):
     base = copy_base(base_dir, tmp_path / "base")
     make_proxies(base, raw_tree, size=SIZE)
-    for use in (
-        lambda: load_gift_i(raw_tree, "train", teacher=base, size=(56, 84))[0],
-        lambda: make_proxies(base, raw_tree, size="56x84"),
-    ):
-        with pytest.raises(ValueError) as excinfo:
-            use()
-        one_line(excinfo, "it was made with size 56x70, not 56x84", "--size 56x84 --overwrite")
     row = load_gift_i(raw_tree, "train", teacher=base)[0]
     with pytest.raises(ValueError, match=r"scene_0: its proxies are 56x70 but the size in use is 56x84"):
         collate_group(row, tiny_processor(), (56, 84))
@@ -119,7 +173,7 @@ def test_hub_ids_are_pinned_by_commit(raw_tree, base_dir, tmp_path, monkeypatch)
         return f"/cache/models--owner--net/snapshots/{commits[revision or 'main']}/{name}"
 
     monkeypatch.setattr("transformers.utils.hub.cached_file", cached_file)
-    monkeypatch.setattr(loading, "load_base", lambda base, revision: (tiny_model(), tiny_processor()))
+    monkeypatch.setattr(loading, "load_base", lambda *given, **options: (tiny_model(), tiny_processor()))
     commits["main"] = commits["v1"] = "a" * 40
     assert teacher_id("owner/net") == "owner--net" and teacher_id("owner/net", "v1") == "owner--net@v1"
     assert teacher_revision("owner/net", "v1") == "a" * 40
@@ -140,7 +194,7 @@ def test_missing_proxy_names_file_and_command(raw_tree, base_dir):
     with pytest.raises(FileNotFoundError) as excinfo:
         load_gift_i(raw_tree, "train", teacher=base_dir, size=SIZE)[0]
     command = f"gift-peft proxies --base {base_dir} --dataset {raw_tree} --size 56x70"
-    one_line(excinfo, raw_tree / "proxies" / base_dir.name / "train/scene_0.safetensors", f"`{command}`")
+    one_line(excinfo, raw_tree / "proxies" / base_dir.name / "56x70/train/scene_0.safetensors", f"`{command}`")
 
 
 def test_a_proxy_file_that_lacks_an_image(raw_tree, base_dir):

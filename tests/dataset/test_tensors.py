@@ -125,8 +125,8 @@ def test_mask_modes(tmp_path):
     pattern = RNG.random((6, 7)) > 0.5
     with pytest.raises(ValueError, match=r"m\.png: mode RGB; a mask has a single channel"):
         to_mask(Image.fromarray(PICTURE), "m.png")
-    indexed = Image.fromarray(pattern.astype(np.uint8), "P")
-    indexed.putpalette([0, 0, 0, 128, 0, 0])  # as annotation tools write it: dark red, which grey would call dark
+    indexed = Image.fromarray((~pattern).astype(np.uint8), "P")
+    indexed.putpalette([255, 255, 255, 0, 0, 0])  # white first, as some programs order it
     indexed.save(tmp_path / "p.png")
     Image.fromarray(pattern).save(tmp_path / "1.png")
     Image.fromarray(pattern.astype(np.uint16) * 65535).save(tmp_path / "16.png")

@@ -18,6 +18,7 @@ from gift_peft import cli, load_gift_i
 from gift_peft.dataset.export import export_parquet
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.demo import run
+from gift_peft.demo.side_by_side import KINDS as KIND_LABELS
 from gift_peft.training.progress import Progress
 
 KINDS = ("mirror", "pane", "solid")
@@ -53,15 +54,26 @@ def embedded(tmp_path, monkeypatch):
 
 def test_demo_leaves_everything_it_promises(embedded, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    reports = run.run_demo("demo", extra=["--num_train_epochs=1", "--retain=2"])
-    assert set(reports) == {"proxy", "depth"}
+    reports = run.run_demo("demo", extra=["--num_train_epochs=1"])
+    assert {target: list(pair) for target, pair in reports.items()} == {
+        target: ["proxy", "depth"] for target in ("consensus", "surface")
+    }
     printed = capsys.readouterr().out
-    assert "Against true depth" in printed and "demo/before_after.png" in printed
+    assert "Training 2 of 2: surface targets" in printed and "ToM RMSE, true depth" in printed
+    assert "demo/before_after.png" in printed and "demo/surface/adapter" in printed
     assert "\x1b[" not in printed  # not a terminal
+    assert max(map(len, printed.split("ToM RMSE, true depth")[1].splitlines())) <= 80
     with Image.open("demo/before_after.png") as picture:
-        assert picture.width > 1000
+        assert picture.width > 2500  # five columns
     text = Path("demo/report.md").read_text()
-    assert all(label in text for label in run.KINDS.values()) and "consensus" in text.lower()
+    assert all(label in text for label in KIND_LABELS.values()) and "consensus" in text.lower()
+    assert "## Paper's objective, in full" in text and "## Surface targets, in full" in text
+    check_side_by_side(text, reports)
+    left = {path.name for path in Path("demo/surface").iterdir()}
+    shared = {"adapter", "adapter-last", "config.yaml", "metrics.jsonl", "evaluation-proxy", "evaluation-depth"}
+    assert shared <= left and shared <= set(os.listdir("demo")) and "base" not in left
+    assert "target: surface" in Path("demo/surface/config.yaml").read_text()
+    assert json.loads(Path("demo/surface/adapter/gift.json").read_text())["arguments"]["target"] == "surface"
     assert sorted(os.listdir("demo/gift-i")) == ["README.md", "data", "proxies"]  # what `export` writes, and proxies
     assert "(validation.html)" in text
     page = Path("demo/validation.html").read_text()
@@ -78,6 +90,31 @@ def test_demo_leaves_everything_it_promises(embedded, tmp_path, monkeypatch, cap
     run.run_demo("demo", overwrite_output_dir=True, seed=1, extra=["--max_steps=1", "--head=lora"])
     assert len(Path("demo/metrics.jsonl").read_text().splitlines()) == 2
     assert "1 updates" in Path("demo/report.md").read_text() and "1 epochs" in text
+
+
+def check_side_by_side(text, reports):
+    """The table's numbers are those of the reports, computed here from their rows."""
+    lines = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in text.splitlines() if line.startswith("| ")}
+    for reference, against in (("depth", "true depth"), ("proxy", "the proxy")):
+        for region, name in (("tom", "ToM"), ("other", "Other")):
+            cells = lines[f"{name} RMSE, {against} ↓"]
+            rows = reports["consensus"][reference].rows
+            assert float(cells[0]) == pytest.approx(np.mean([row["base"][region]["rmse"] for row in rows]), rel=1e-3)
+            for cell, target in zip(cells[1:], ("consensus", "surface"), strict=True):
+                rows = reports[target][reference].rows
+                expected = np.mean([row["adapted"][region]["rmse"] for row in rows])
+                assert float(cell.strip(" *").split()[0]) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("target", ["consensus", "surface"])
+def test_one_target_alone_is_the_demo(embedded, tmp_path, monkeypatch, capsys, target):
+    monkeypatch.chdir(tmp_path)
+    assert list(run.run_demo("demo", target=target, extra=["--max_steps=1"])) == [target]
+    assert f"target: {target}" in Path("demo/config.yaml").read_text()
+    assert not Path("demo/surface").exists() and Path("demo/adapter").is_dir()
+    assert "Training 1" not in capsys.readouterr().out
+    with Image.open("demo/before_after.png") as picture:
+        assert 2000 < picture.width < 2500  # four columns
 
 
 @pytest.mark.parametrize(
@@ -103,6 +140,46 @@ def test_the_demo_is_channels_last_where_it_can_and_may_be(embedded, tmp_path, m
     assert asked[0].channels_last is channels_last
 
 
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("theirs", "said"),
+    [
+        ("base/model.safetensors", "base holds files"),
+        ("gift-i/train/hall/0.png", "gift-i holds files"),
+        ("report.md", "has report.md"),
+        ("evaluation-depth/notes.txt", "has evaluation-depth"),
+        ("config.yaml", "has config.yaml"),
+    ],
+)
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_the_demo_keeps_what_no_demo_wrote(theirs, said, overwrite, embedded, tmp_path):
+    out = tmp_path / "demo"
+    (out / theirs).parent.mkdir(parents=True)
+    (out / theirs).write_text("mine: 1\n")
+    with pytest.raises(ValueError, match=said):
+        run.run_demo(out, overwrite_output_dir=overwrite)
+    assert (out / theirs).read_text() == "mine: 1\n"
+
+
+def test_a_demo_again_replaces_its_own_and_nothing_added(embedded, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run._copy_embedded("base", Path("demo/base"), earlier=False)  # as a demo that was killed here
+    run._copy_embedded("base", Path("demo/base"), earlier=False)
+    (tmp_path / "demo/base/notes.txt").write_text("mine")
+    before = contents(tmp_path / "demo/base")
+    run._copy_embedded("base", Path("demo/base"), earlier=True)
+    assert contents(tmp_path / "demo/base") == before  # the same base: nothing to do
+    write_base(embedded / "base", seed=5)  # that of another version
+    with pytest.raises(ValueError, match=r"base holds files .*notes\.txt"):
+        run._copy_embedded("base", Path("demo/base"), earlier=True)
+    (tmp_path / "demo/base/notes.txt").unlink()
+    run._copy_embedded("base", Path("demo/base"), earlier=True)
+    assert contents(tmp_path / "demo/base") == contents(embedded / "base") != before
+
+
 def test_a_stopped_demo_says_how_to_go_on_up_to_table_and_picture(embedded, tmp_path, monkeypatch, capsys):
     out, step = tmp_path / "my demo", Progress.step
 
@@ -112,7 +189,7 @@ def test_a_stopped_demo_says_how_to_go_on_up_to_table_and_picture(embedded, tmp_
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Progress, "step", step_and_stop)
-        run.run_demo(out, seed=3, extra=["--num_train_epochs=2", "--retain", "2"])
+        run.run_demo(out, seed=3, extra=["--num_train_epochs=2"])
     told = capsys.readouterr().out.splitlines()[-1]
     words = shlex.split(told)
     assert words[:2] == ["gift-peft", "demo"] and "--num_train_epochs=2" in words and not (out / "report.md").exists()

@@ -121,7 +121,7 @@ def test_existing_folders_are_kept(case, tmp_path):
     name, source, config, _ = case
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine.txt").write_text("mine")
-    with pytest.raises(ValueError, match="already exists"):
+    with pytest.raises(ValueError, match=r"holds files .*mine\.txt.* kept"):
         CONVERTERS[name](source, tmp_path / "out", config)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine.txt"]
     (tmp_path / "empty").mkdir()

@@ -84,7 +84,7 @@ def test_empty_masks_are_refused_or_allowed(tmp_path, capsys):
     raw, out = str(tmp_path / "raw"), str(tmp_path / "out")
     with pytest.raises(SystemExit):
         main(["prepare", raw, out])
-    assert "1.png (1.png) has no target in its mask" in capsys.readouterr().err
+    assert "1.png (masks/1.png) has no target in its mask" in capsys.readouterr().err
     report = prepare_gift_i(raw, out, PrepareSettings(empty_masks="allow"))
     text = str(entry(report, "g")["frames"][1]["reasons"])
     assert "has no target" not in text and entry(report, "g")["status"] == "kept"

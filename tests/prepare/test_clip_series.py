@@ -34,7 +34,7 @@ def at_size(picture: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def stills() -> list[tuple[list[np.ndarray], np.ndarray]]:
-    """Pictures of one pose and their mask: the embedded rendered groups; real photos with other photos in the glass."""
+    """Pictures of one pose, and a mask: the embedded rendered groups; real photos with other photos in the glass."""
     found = []
     for split in ("train", "validation"):
         for row in load_gift_i(str(files("gift_peft") / "demo" / "gift-i"), split).select(range(12)):

@@ -57,14 +57,14 @@ def test_dynamics_draws_what_was_logged(tmp_path, drawn):
     for row, train in zip(rows, [0.8, 0.4, 0.4, 0.2], strict=True):
         row["train_gce"] = train
     paths = [tmp_path / "a.png", tmp_path / "a.pdf"]
-    assert draw_dynamics([("DA", rows)], paths) == ["train GCE", "validation GCE"]
+    assert draw_dynamics([("DA", rows)], paths) == [curves.DYNAMICS["train_gce"], curves.DYNAMICS["val_gce"]]
     assert all(path.stat().st_size > 1000 for path in paths) and len(list(tmp_path.iterdir())) == 2
     labels = {label: values for _, label, _, values, *_ in drawn if label}
-    assert labels["validation GCE"] == pytest.approx(smooth([1, 0.5, 0.25, 0.25], 3))
-    assert labels["train GCE"] == pytest.approx(smooth([1, 0.5, 0.5, 0.25], 3))
+    assert labels[curves.DYNAMICS["val_gce"]] == pytest.approx(smooth([1, 0.5, 0.25, 0.25], 3))
+    assert labels[curves.DYNAMICS["train_gce"]] == pytest.approx(smooth([1, 0.5, 0.5, 0.25], 3))
     for row in rows:
         row["booster_tom_rmse"] = 100.0
-    assert "Booster ToM RMSE" in draw_dynamics([("DA", rows)], paths)
+    assert curves.DYNAMICS["booster_tom_rmse"] in draw_dynamics([("DA", rows)], paths)
 
 
 def test_retention_shows_diverged_runs_and_then_the_rest(tmp_path, drawn):
@@ -95,3 +95,20 @@ def test_a_curve_that_starts_at_zero_is_said(tmp_path):
     with pytest.raises(ValueError, match="the curve cannot be relative"):
         draw_dynamics([("DA", history([0.0, 0.3]))], [tmp_path / "a.png"])
     assert not list(tmp_path.iterdir()) and curves.DIVERGED == 2
+
+
+def test_titles_and_legends_explain_themselves_and_hide_no_curve(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    shown = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *args, **more: (shown.append(self), save(self, *args, **more)))
+    draw_dynamics([("DA", history([0.4, 0.2, 0.1]))], [tmp_path / "a.png"])
+    draw_retention([("1:1", history([0.4, 0.5], "val_other_rmse"))], [tmp_path / "b.png"])
+    for figure, title in zip(shown, ("inside the target", "outside the target"), strict=True):
+        assert title in figure.get_suptitle() and "lower is better" in figure.get_suptitle()
+        (axis,) = figure.axes
+        legend, frame = axis.get_legend().get_window_extent(), axis.get_window_extent()
+        assert legend.y1 <= frame.y0 and legend.x0 >= 0 and legend.x1 <= figure.bbox.x1 and legend.y0 >= 0
+        assert "the base" in [text.get_text() for text in axis.get_legend().get_texts()]
+        assert axis.get_ylabel() == "times the base's value"

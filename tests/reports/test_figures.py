@@ -168,7 +168,7 @@ def test_the_color_bar_goes_from_near_to_far_with_units(kind):
     )
     assert row.bar.left.startswith("near: ") and row.bar.right.startswith("far: ")
     assert "e" not in row.bar.left.split()[1] + row.bar.right.split()[1]
-    assert "(the model's units)" in row.bar.left
+    assert "(the model's units)" in row.bar.right
     assert (row.bar.colors[0, 0] == row.tiles[1][0, 0]).all() and (row.bar.colors[0, -1] == row.tiles[2][0, 0]).all()
     millimeters = panel_row(panel(kind=kind)).bar
     first, last = (int(text.split()[1].replace(",", "")) for text in (millimeters.left, millimeters.right))

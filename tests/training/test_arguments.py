@@ -1,5 +1,7 @@
 """YAML, then the command line; every wrong argument is one line that names it."""
 
+from pathlib import Path
+
 import pytest
 import yaml
 
@@ -160,3 +162,12 @@ def test_the_configurations_with_surface_targets_keep_the_papers_other_settings(
     differing = {key for key in ours.keys() & paper.keys() if ours[key] != paper[key]}
     assert differing == {"target", "lambda_c", "output_dir", "config"}
     assert ours["flip"] and ours["fills"] == 6
+
+
+def test_the_home_folder_in_yaml_and_python(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    write(tmp_path / "c.yaml", "model_name_or_path: ~/m\ndataset_name: ~/d\noutput_dir: ~/o\n")
+    args = parse_arguments(["--config=~/c.yaml", "--proxies_dir=~/p"])
+    places = (args.model_name_or_path, args.dataset_name, args.output_dir, args.proxies_dir)
+    assert places == tuple(f"{tmp_path}/{name}" for name in "mdop")
+    assert GiftTrainingArguments("~/m", "d", Path("~/o")).output_dir == f"{tmp_path}/o"

@@ -18,7 +18,9 @@ from gift_peft import cli
 from gift_peft.dataset.gift_i import dataset_fingerprint, load_gift_i
 from gift_peft.dataset.writer import write_gift_i
 from gift_peft.group_step import GroupStep
+from gift_peft.models.identity import earlier_revision
 from gift_peft.training import checkpoints, loop, progress, train, validation
+from gift_peft.training.start import stop_signals
 
 
 @pytest.fixture
@@ -115,7 +117,45 @@ def test_interrupted_twice_the_last_checkpoint_is_the_same_to_the_byte(args, who
         assert (tmp_path / "out/checkpoint-4" / name).read_bytes() == (whole / "checkpoint-4" / name).read_bytes()
 
 
-@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_checkpoint_that_pins_the_files_of_its_base_goes_on(args, whole, base_dir, tmp_path):
+    """As 0.1.0 wrote them."""
+    out = shutil.copytree(whole, tmp_path / "out", ignore=shutil.ignore_patterns("checkpoint-4", "adapter-last"))
+    assert (out / "checkpoint-3").is_dir()
+
+    def pin(revision):
+        folder = out / "checkpoint-3"
+        state = json.loads((folder / checkpoints.STATE).read_text())
+        state["identity"]["model_name_or_path"] = revision
+        (folder / checkpoints.STATE).write_text(json.dumps(state))
+        sums = json.loads((folder / checkpoints.CHECKSUMS).read_text())
+        sums[checkpoints.STATE] = checkpoints._digest(folder / checkpoints.STATE)
+        (folder / checkpoints.CHECKSUMS).write_text(json.dumps(sums))
+
+    pin("sha256:" + "0" * 32)
+    with pytest.raises(ValueError, match="the base model's weights have changed"):
+        train_again(args)
+    pin(earlier_revision(base_dir))
+    train_again(args)
+    assert_same_run(out, whole)
+
+
+def test_a_closed_terminal_stops_no_run_started_with_nohup():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_signals() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop.signum
+            os.kill(os.getpid(), signal.SIGUSR1)
+            assert stop.signum == signal.SIGUSR1
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize(
+    ("signum", "code"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGUSR1, 138), (signal.SIGHUP, 129)],
+)
 def test_signals_checkpoint_after_the_group_and_say_how_to_go_on(
     signum, code, args, whole, tmp_path, monkeypatch, capsys
 ):

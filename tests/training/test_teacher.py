@@ -69,7 +69,7 @@ def lambda_model(model):
 
 def test_proxies_are_the_models_predictions(raw_tree, base_dir, model):
     folder = make_proxies(base_dir, raw_tree, size=SIZE)
-    assert folder == raw_tree / "proxies" / teacher_id(base_dir)
+    assert folder == raw_tree / "proxies" / teacher_id(base_dir) / "56x70"
     assert list(files(folder)) == [f"{group}.safetensors" for group in GROUPS]
     for split in ("train", "validation"):
         for row in load_gift_i(raw_tree, split, teacher=base_dir, size=SIZE):
@@ -102,7 +102,7 @@ def test_first_distillation_is_exactly_zero(raw_tree, base_dir, model):
 def test_rows_with_proxies_behave_as_a_dataset(raw_tree, base_dir, tmp_path):
     make_proxies(base_dir, raw_tree, size=SIZE, proxies_dir=tmp_path / "elsewhere")
     rows = load_gift_i(raw_tree, "train", teacher=base_dir, proxies_dir=tmp_path / "elsewhere")
-    (tmp_path / "elsewhere" / teacher_id(base_dir) / "train/scene_1.safetensors").unlink()
+    (tmp_path / "elsewhere" / teacher_id(base_dir) / "56x70/train/scene_1.safetensors").unlink()
     assert rows[0]["proxies"].shape == (2, *SIZE)  # only the rows that are accessed are read
     assert rows["group_id"][:] == ["scene_0", "scene_1"]
     with pytest.raises(FileNotFoundError, match="scene_1"):
@@ -175,7 +175,7 @@ def test_kill_leaves_no_broken_file(raw_tree, base_dir, tmp_path, moment):
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL
-    folder = raw_tree / "proxies" / teacher_id(base_dir)
+    folder = raw_tree / "proxies" / teacher_id(base_dir) / "56x70"
     left = files(folder)
     assert len(left) == 1 and left.items() <= whole.items()
     assert len(list(folder.rglob(".*.partial"))) == 1
@@ -200,9 +200,9 @@ def test_two_processes_make_the_same_files(base_dir, tmp_path):
     raw = write_raw_tree(tmp_path / "raw", train=(2, 3, 5), validation=(1, 2))
     alone = make_proxies(base_dir, raw, size=SIZE, proxies_dir=tmp_path / "one")
     debug_launcher(_make_in_two, (base_dir, raw, tmp_path / "two"), num_processes=2)
-    assert files(tmp_path / "two" / alone.name) == files(alone) and len(files(alone)) == 5
+    assert files(tmp_path / "two" / teacher_id(base_dir) / "56x70") == files(alone) and len(files(alone)) == 5
     # What one process stumbles over, all report, and none is left waiting.
-    stale = tmp_path / "two" / alone.name / "train" / "scene_1.safetensors"
+    stale = tmp_path / "two" / teacher_id(base_dir) / "56x70" / "train" / "scene_1.safetensors"
     Image.new("RGB", (80, 60)).save(raw / "train/scene_1/0.png")
     (tmp_path / "seen").mkdir()
     debug_launcher(_fail_in_two, (base_dir, raw, tmp_path / "two", tmp_path / "seen"), num_processes=2)

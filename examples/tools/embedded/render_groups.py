@@ -1,6 +1,12 @@
 """Render the groups of the mini GIFT-I: one camera, one geometry, and a target whose content changes.
 
     python examples/tools/embedded/render_groups.py --out renders/groups --processes 2
+    python examples/tools/embedded/render_groups.py --out renders --set fresh_1 --first_seed 20000000 --count 24
+    python examples/tools/embedded/render_groups.py --out renders --set singles --first_seed 30000000 --count 1000 \
+        --photos
+
+Without `--set` it renders the shipped dataset. `--set NAME` renders `--count` more groups, a third of each kind, from
+scene seeds that nothing else has; `--photos` only one photo a scene, in which the surface itself cannot be seen.
 
 A mirror reflects a room that is rearranged behind the camera, or has a sheet hung before it; a pane stands before
 things that are moved, or has a card touching its back; a glass object shows what is behind it, or is filled or lined.
@@ -245,8 +251,11 @@ def smaller(picture: np.ndarray) -> np.ndarray:
     return cv2.resize(picture, KEPT, interpolation=cv2.INTER_AREA)
 
 
-def make_group(seed: int, kind: str):
-    """Images, mask, depths and reference of one group, or None where the plan turns out badly."""
+def make_group(seed: int, kind: str, single: bool = False):
+    """Images, mask, depths and reference of one group, or None where the plan turns out badly.
+
+    `single`: one observation, which shows nothing of the surface but its dust.
+    """
     import tracer
 
     rng = np.random.default_rng([20260102, seed])
@@ -276,6 +285,8 @@ def make_group(seed: int, kind: str):
     reference = lamp * direct + ambient * albedo
     exposure = tracer.auto_exposure(reference)
     count = int(rng.choice([3, 4, 5, 6, 7, 8, 9], p=[0.7, 0.2, 0.06, 0.01, 0.01, 0.01, 0.01]))
+    if single:
+        count = 1
     hidden = max(1, count // 3)
     shown = rng.permutation([True] * (count - hidden) + [False] * hidden)
     images, depths = [], []
@@ -299,9 +310,9 @@ def make_group(seed: int, kind: str):
 
 
 def work(task) -> str:
-    folder, kind, first_seed = task
+    folder, kind, first_seed, single = task
     for attempt in range(200):
-        group = make_group(first_seed + attempt, kind)
+        group = make_group(first_seed + attempt, kind, single)
         if group is not None:
             break
     else:
@@ -323,21 +334,46 @@ def work(task) -> str:
     return folder.name
 
 
+def shipped(out: Path) -> list[tuple]:
+    """The tasks of the dataset that the package ships."""
+    tasks = []
+    for split, kinds in SPLITS.items():
+        for number, (kind, count) in enumerate(kinds.items()):
+            for index in range(count):
+                seed = FIRST_SEED[split] + (number * 1000 + index) * 200
+                tasks.append((out / split / f"{kind}_{index:03d}", kind, seed, False))
+    return sorted(
+        tasks, key=lambda task: (task[0].parent.name, task[0].name.rsplit("_")[1])
+    )  # all kinds from the start
+
+
+def more(out: Path, first_seed: int, count: int, single: bool) -> list[tuple]:
+    """The tasks of a set of its own: the kinds in turn, so that any first part of it is balanced."""
+    kinds = list(KINDS)
+    return [
+        (out / f"{kinds[index % 3]}_{index:04d}", kinds[index % 3], first_seed + index * 200, single)
+        for index in range(count)
+    ]
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("renders/groups"))
     parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument("--set", help="name of a set of its own below --out")
+    parser.add_argument("--first_seed", type=int, help="of --set: its scenes take seeds from here on, 200 a group")
+    parser.add_argument("--count", type=int, default=24, help="of --set: groups")
+    parser.add_argument("--photos", action="store_true", help="of --set: one see-through or mirroring photo a scene")
     args = parser.parse_args()
-    tasks = []
-    for split, kinds in SPLITS.items():
-        (args.out / split).mkdir(parents=True, exist_ok=True)
-        for number, (kind, count) in enumerate(kinds.items()):
-            for index in range(count):
-                folder = args.out / split / f"{kind}_{index:03d}"
-                seed = FIRST_SEED[split] + (number * 1000 + index) * 200
-                if not folder.exists():
-                    tasks.append((folder, kind, seed))
-    tasks.sort(key=lambda task: (task[0].parent.name, task[0].name.rsplit("_")[1]))  # all kinds from the start
+    if args.set is None:
+        tasks = shipped(args.out)
+    elif args.first_seed is None:
+        parser.error("--set needs --first_seed, and seeds that no other set has")
+    else:
+        tasks = more(args.out / args.set, args.first_seed, args.count, args.photos)
+    tasks = [task for task in tasks if not task[0].exists()]
+    for folder in {task[0].parent for task in tasks}:
+        folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(args.processes) as pool:
         list(tqdm(pool.map(work, tasks), total=len(tasks), unit="group"))
 

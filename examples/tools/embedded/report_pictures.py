@@ -16,7 +16,7 @@ from pathlib import Path
 from PIL import Image
 
 from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.demo.run import KINDS
+from gift_peft.demo.side_by_side import KINDS
 from gift_peft.reports.report import run_report
 
 CARDS = Path(__file__).parents[3] / "model_cards"

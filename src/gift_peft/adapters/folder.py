@@ -20,7 +20,7 @@ from peft import LoraConfig, PeftConfig, PeftModel
 from peft.tuners.lora import LoraLayer
 
 from gift_peft.adapters.scale import active_lora, active_saved_modules
-from gift_peft.files import is_hub_id, jsonable, reason, whole_folder
+from gift_peft.files import check_replaceable, is_hub_id, jsonable, reason, whole_folder
 from gift_peft.rules import KINDS
 
 ADAPTER_CONFIG = "adapter_config.json"
@@ -60,10 +60,10 @@ def save_adapter(
     ):
         raise ValueError("an adapter is saved at scale 1: call set_adapter_scale(model, 1) first")
     folder = Path(folder)
-    _check_replaceable(folder)
+    check_replaceable(folder, ADAPTER_FILES)
     base = base_model_name_or_path or _base_name(model)
     hub_base = _hub_name(base, card)
-    with whole_folder(folder) as temporary:
+    with whole_folder(folder, ADAPTER_FILES) as temporary:
         model.save_pretrained(str(temporary), selected_adapters=["default"], save_embedding_layers=False)
         config = json.loads((temporary / ADAPTER_CONFIG).read_text())
         config.update(base_model_name_or_path=base, revision=revision)
@@ -100,13 +100,6 @@ def _hub_name(base: str | None, card: str | None) -> str | None:
     if card and Path(base).is_absolute() and base in card:
         raise ValueError(f"the card names the local base path {base}")
     return None
-
-
-def _check_replaceable(folder: Path) -> None:
-    if folder.exists() and (others := sorted({path.name for path in folder.iterdir()} - ADAPTER_FILES)):
-        raise ValueError(
-            f"{folder} holds files that are no adapter's ({', '.join(others[:3])}): choose another folder"
-        )
 
 
 def processor_at_size(processor: Any, size: tuple[int, int] | None) -> Any:
@@ -153,10 +146,14 @@ def read_adapter_config(adapter: str | Path) -> LoraConfig:
     Raises FileNotFoundError if there is none or, in a folder, no `adapter_model.safetensors` beside it (pickles are
     not read), ValueError naming file and field for what is no LoRA configuration.
     """
+    if Path(adapter).is_file():
+        raise FileNotFoundError(f"adapter {adapter}: name the folder, {Path(adapter).parent}, not a file in it")
     if Path(adapter).is_dir():
         for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS):
             if not (Path(adapter) / name).is_file():
-                raise FileNotFoundError(f"adapter {adapter}: the folder has no {name}")
+                inside = Path(adapter) / "adapter"
+                hint = f"; this is a run, whose adapter is {inside}" if (inside / name).is_file() else ""
+                raise FileNotFoundError(f"adapter {adapter}: the folder has no {name}{hint}")
         _read_object(adapter, ADAPTER_CONFIG)
     where = f"adapter {adapter}: damaged {ADAPTER_CONFIG}"
     try:
@@ -176,7 +173,7 @@ def read_adapter_config(adapter: str | Path) -> LoraConfig:
 def read_gift(adapter: str | Path) -> dict[str, Any]:
     """An adapter folder's gift.json; empty without one (an adapter that PEFT alone saved, or one on the hub)."""
     content = _read_object(adapter, GIFT) if (Path(adapter) / GIFT).is_file() else {}
-    for name, values in (("base_revision", None), ("kind", KINDS)):
+    for name, values in (("base_revision", None), ("base_weights", None), ("kind", KINDS)):
         value = content.get(name)
         if value is not None and (not isinstance(value, str) or (values and value not in values)):
             raise ValueError(f"adapter {adapter}: damaged {GIFT} ({name} cannot be {str(value)[:80]!r})")

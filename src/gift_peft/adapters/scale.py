@@ -34,7 +34,8 @@ def set_adapter_scale(model: nn.Module, scale: float) -> None:
     """Fade the active adapter: LoRA times `scale`, saved modules at base + scale * (trained - base).
 
     0 is the base and 1 the adapter, to the bit, in any order of calls. `model` is a `PeftModel` or a model that
-    transformers loaded from an adapter folder. Set the scale to 1 before training or saving.
+    transformers loaded from an adapter folder. What was switched off, in part perhaps (transformers' own
+    `enable_adapters()` leaves saved modules off), is on afterwards. Set the scale to 1 before training or saving.
     Raises ValueError for a non-finite scale, a model without or with a merged adapter, and weights changed meanwhile.
     """
     if not math.isfinite(scale):
@@ -47,6 +48,9 @@ def set_adapter_scale(model: nn.Module, scale: float) -> None:
     for config in getattr(model, "peft_config", {}).values():
         check_lora_config(config)
     trained = [_trained_state(wrapper, name) for wrapper, name in wrappers]  # checks all before changing any
+    for module in [*(layer for layer, _ in layers), *(wrapper for wrapper, _ in wrappers)]:
+        if module.disable_adapters:
+            module.enable_adapters(True)
     for layer, name in layers:
         layer.set_scale(name, scale)
     for (wrapper, name), state in zip(wrappers, trained, strict=True):

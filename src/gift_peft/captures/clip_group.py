@@ -6,9 +6,10 @@ from pathlib import Path
 
 from gift_peft.captures.clip import TimeInClip, find_clips, read_time
 from gift_peft.captures.folders import PICTURE_MASKS, files_below, subfolders
+from gift_peft.captures.group_facts import GROUP_FILES, read_facts
 from gift_peft.captures.links import checked
 from gift_peft.captures.masks import MaskSource, find_group_mask, is_group_mask, is_mask_file
-from gift_peft.captures.tree import GROUP_FILES, is_reference, read_facts
+from gift_peft.captures.tree import is_reference
 from gift_peft.images import is_image_file
 
 

@@ -14,22 +14,22 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from gift_peft.captures.coco import CocoImage, coco_images
-from gift_peft.captures.folders import EXPORTS, holds_no_photos, photo_names, same_name, subfolders
+from gift_peft.captures.folders import EXPORTS, Listing, holds_no_photos, same_name
 from gift_peft.captures.label_studio import LabelStudioImage, label_studio_images
-from gift_peft.files import is_leftover
 from gift_peft.images import is_image_file
 
 UPLOAD_PREFIX = re.compile(r"^[0-9a-f]{8}-")  # Label Studio puts it before the names of uploaded files
 TOOLS = {"coco": "COCO", "label-studio": "Label Studio"}
 
 
-def list_exports(base: Path) -> Iterator[Path]:
+def list_exports(base: Path, listing: Listing) -> Iterator[Path]:
     """JSON files of a folder that may hold many images: those that are not one image's own."""
-    for folder in (base, *subfolders(base, EXPORTS)):
-        if folder.is_dir():
-            files = sorted(path for path in folder.iterdir() if not is_leftover(path.name))
-            images = {path.stem for path in (*files, *base.iterdir()) if is_image_file(path)}
-            yield from (path for path in files if path.suffix.lower() == ".json" and path.stem not in images)
+    for folder in (base, *listing.subfolders(base, EXPORTS)):
+        for path in listing.entries(folder):
+            stem = same_name(path.stem)
+            own = stem in listing.photo_stems(folder) or stem in listing.photo_stems(base)
+            if path.suffix.lower() == ".json" and not own:
+                yield path
 
 
 def read_export(path: Path) -> tuple[str, dict[str, CocoImage] | dict[str, LabelStudioImage]]:
@@ -49,6 +49,12 @@ def _parsed(path: Path, modified: int, length: int) -> tuple[str, dict]:
             return "coco", coco_images(content)
         if isinstance(content, list) and all(isinstance(task, dict) and "data" in task for task in content):
             return "label-studio", label_studio_images(content)
+        if (
+            isinstance(content, list)
+            and content
+            and all(isinstance(item, dict) and "annotation_id" in item for item in content)
+        ):
+            raise ValueError("Label Studio's short form (JSON-MIN) is not read; export as JSON or COCO")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return "other", {}
@@ -64,7 +70,9 @@ def load_json(path: Path) -> Any:
         raise ValueError(f"{path}: not valid JSON, or cut short") from None
 
 
-def find_entry(names: Sequence[str], photo: Path, group_dir: Path, export: Path, base: Path) -> str | None:
+def find_entry(
+    names: Sequence[str], photo: Path, group_dir: Path, export: Path, base: Path, listing: Listing
+) -> str | None:
     """Which of an export's image names means this photo; `base` is the folder that the export belongs to.
 
     ValueError where two names, or one name and two photos of the group, fit.
@@ -73,8 +81,7 @@ def find_entry(names: Sequence[str], photo: Path, group_dir: Path, export: Path,
     needed = _parts(photo.relative_to(group_dir if inside else group_dir.parent).as_posix())
     for form in (_parts, _stripped, _loose):
         if form is _loose:  # the export of photos that were converted, or renamed by a system without capitals
-            alike = [name for name in photo_names(group_dir) if name.casefold() == same_name(photo.stem).casefold()]
-            if len(alike) > 1:
+            if sum(is_image_file(path) for path in listing.called(photo.parent, same_name(photo.stem))) > 1:
                 break
             needed = _loose("/".join(needed))
         matches, short = [], False
@@ -91,15 +98,15 @@ def find_entry(names: Sequence[str], photo: Path, group_dir: Path, export: Path,
                 raise ValueError(f"{export}: {found} may mean several images called {photo.name}; rename them")
             return found
     matches = [] if inside else _bare(names, photo)
-    return _only(matches, photo, export) if matches and photo_names(base)[same_name(photo.name)] == 1 else None
+    return _only(matches, photo, export) if matches and listing.photo_names(base)[same_name(photo.name)] == 1 else None
 
 
-def describe_export(path: Path, photo: Path, base: Path, group_dir: Path) -> str | None:
+def describe_export(path: Path, photo: Path, base: Path, group_dir: Path, listing: Listing) -> str | None:
     """What to tell somebody whose photo is not in this export; None for a file that is none."""
     kind, images = read_export(path)
     if kind not in TOOLS:
         return None
-    count = photo_names(base)[same_name(photo.name)]
+    count = listing.photo_names(base)[same_name(photo.name)]
     if base != group_dir and count > 1 and _bare(list(images), photo):
         below = photo.relative_to(group_dir.parent).as_posix()
         return (

@@ -30,12 +30,47 @@ def holds_no_photos(folder: str) -> bool:
     return is_leftover(folder) or name in NOT_PHOTOS or name.startswith("segmentation")
 
 
-def subfolders(folder: Path, names: tuple[str, ...]) -> list[Path]:
-    """Folders in `folder` with one of these names, written in any case, in the order of the names."""
-    if not folder.is_dir():
-        return []
-    found = [path for path in folder.iterdir() if path.name.casefold() in names and path.is_dir()]
-    return sorted(found, key=lambda path: (names.index(path.name.casefold()), path.name))
+class Listing:
+    """What lies in folders, each listed once however many photos are looked up; not for longer than one group."""
+
+    def __init__(self) -> None:
+        self._entries: dict[Path, list[Path]] = {}
+        self._stems: dict[Path, dict[str, list[Path]]] = {}
+        self._photos: dict[Path, set[str]] = {}
+        self._names: dict[Path, Counter] = {}
+
+    def entries(self, folder: Path) -> list[Path]:
+        """Sorted, without leftovers; [] where there is no such folder."""
+        if folder not in self._entries:
+            there = folder.iterdir() if folder.is_dir() else ()
+            self._entries[folder] = sorted(path for path in there if not is_leftover(path.name))
+        return self._entries[folder]
+
+    def subfolders(self, folder: Path, names: tuple[str, ...]) -> list[Path]:
+        """Those with one of these names, written in any case, in the order of the names."""
+        found = [path for path in self.entries(folder) if path.name.casefold() in names and path.is_dir()]
+        return sorted(found, key=lambda path: (names.index(path.name.casefold()), path.name))
+
+    def called(self, folder: Path, stem: str) -> list[Path]:
+        """Entries whose name without its suffix is this one, in any case."""
+        if folder not in self._stems:
+            stems: dict[str, list[Path]] = {}
+            for path in self.entries(folder):
+                stems.setdefault(same_name(path.stem).casefold(), []).append(path)
+            self._stems[folder] = stems
+        return self._stems[folder].get(stem.casefold(), [])
+
+    def photo_stems(self, folder: Path) -> set[str]:
+        """Names of the pictures in a folder, without their suffixes."""
+        if folder not in self._photos:
+            self._photos[folder] = {same_name(path.stem) for path in self.entries(folder) if is_image_file(path)}
+        return self._photos[folder]
+
+    def photo_names(self, folder: Path) -> Counter:
+        """How many pictures in and below a folder have each file name, and each name without its suffix."""
+        if folder not in self._names:
+            self._names[folder] = _counted(folder, _stamp(folder))
+        return self._names[folder]
 
 
 def files_below(folder: Path) -> Iterator[Path]:
@@ -61,12 +96,7 @@ def files_below(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def photo_names(folder: Path) -> Counter:
-    """How many pictures in and below a folder have each file name, and each name without its suffix."""
-    return _counted(folder, _stamp(folder))
-
-
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4)  # of a root, for all its groups
 def _counted(folder: Path, _: tuple) -> Counter:
     names: Counter = Counter()
     for path in files_below(folder):

@@ -16,9 +16,10 @@ from pathlib import Path
 
 from gift_peft.captures.folders import same_name, subfolders
 from gift_peft.captures.foreign import Layout, read_layout
+from gift_peft.captures.group_facts import read_facts
 from gift_peft.captures.links import checked
 from gift_peft.captures.masks import MASK_SUFFIXES, MaskSource
-from gift_peft.captures.tree import Capture, read_facts
+from gift_peft.captures.tree import Capture
 from gift_peft.files import is_leftover
 from gift_peft.images import is_image_file, natural_key, sort_pictures
 from gift_peft.options import did_you_mean

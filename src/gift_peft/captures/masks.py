@@ -17,11 +17,10 @@ from PIL import Image
 
 from gift_peft.captures.cvat import labelmap_path, read_colors
 from gift_peft.captures.exports import describe_export, find_entry, list_exports, load_json, namesakes, read_export
-from gift_peft.captures.folders import EXPORTS, PICTURE_MASKS, holds_no_photos, photo_names, same_name, subfolders
+from gift_peft.captures.folders import EXPORTS, PICTURE_MASKS, Listing, holds_no_photos, same_name
 from gift_peft.captures.labelme import read_labelme
 from gift_peft.captures.labels import MaskClass, check_size, split_classes
 from gift_peft.captures.links import checked
-from gift_peft.files import is_leftover
 from gift_peft.images import SINGLE_CHANNEL, SUFFIXES, is_image_file, open_image, to_mask
 
 MASK_SUFFIXES = SUFFIXES | {".gif"}
@@ -118,14 +117,18 @@ def find_group_mask(
     return found[0] if found else None
 
 
-def find_mask(image_path: Path, group_dir: Path, root: Path, mask_class: MaskClass = None) -> MaskSource | None:
+def find_mask(
+    image_path: Path, group_dir: Path, root: Path, mask_class: MaskClass = None, listing: Listing | None = None
+) -> MaskSource | None:
     """The mask of an image inside `group_dir` (itself inside `root`), or None if there is no file that could hold it.
+
+    Several images of a group share one `listing`.
 
     Raises ValueError naming the file for a damaged export, an ambiguous one, one that names files by absolute paths
     or with `..`, and for a mask whose links lead nowhere, or out of `root` and not where the photo's lead.
     """
-    bases = _bases(group_dir, root)
-    for path in _own_files(image_path, group_dir, bases):
+    bases, listing = _bases(group_dir, root), listing or Listing()
+    for path in _own_files(image_path, group_dir, bases, listing):
         kind = "png"
         if path.suffix.lower() == ".json":
             content = load_json(checked(path, root, image_path))
@@ -140,16 +143,16 @@ def find_mask(image_path: Path, group_dir: Path, root: Path, mask_class: MaskCla
         return MaskSource(checked(path, root, image_path), kind, None, mask_class)
     listed = None
     for base in bases:
-        for path in list_exports(base):
+        for path in list_exports(base, listing):
             kind, images = read_export(checked(path, root, image_path))
-            entry = find_entry(list(images), image_path, group_dir, path, base)
+            entry = find_entry(list(images), image_path, group_dir, path, base, listing)
             if entry is not None:
                 source = MaskSource(path, kind, entry, mask_class)
                 if images[entry].annotated:
                     return source
                 listed = listed or source
-    for folder in (image_path.parent, group_dir, *subfolders(group_dir, PICTURE_MASKS)):
-        if unnamed := next(filter(_is_label_studio_picture, folder.iterdir()), None):
+    for folder in (image_path.parent, group_dir, *listing.subfolders(group_dir, PICTURE_MASKS)):
+        if unnamed := next(filter(_is_label_studio_picture, listing.entries(folder)), None):
             raise ValueError(
                 f"{unnamed}: Label Studio's PNG export names the task but not the image; rename it to "
                 f"{image_path.stem}_mask.png, or export as JSON or COCO"
@@ -161,15 +164,22 @@ def explain_missing(image_path: Path, group_dir: Path, root: Path) -> str:
     """What was looked for in vain and what was seen instead, in one line."""
     expected = image_path.parent / "masks" / f"{image_path.stem}.png"
     parts = [f"missing mask {expected} for the image {image_path.name}"]
-    names = photo_names(group_dir)
-    for folder in dict.fromkeys([*subfolders(image_path.parent, EXPORTS), *subfolders(group_dir, EXPORTS)]):
-        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in MASK_SUFFIXES)
-        strange = [path.name for path in files if same_name(path.stem) not in names and not is_leftover(path.name)]
+    listing = Listing()
+    names = listing.photo_names(group_dir)
+    for folder in dict.fromkeys(
+        [*listing.subfolders(image_path.parent, EXPORTS), *listing.subfolders(group_dir, EXPORTS)]
+    ):
+        files = [path for path in listing.entries(folder) if path.suffix.lower() in MASK_SUFFIXES]
+        strange = [path.name for path in files if same_name(path.stem) not in names]
         if strange:
             more = f" and {len(strange) - 2} more fit" if len(strange) > 2 else " fit" + "s" * (len(strange) == 1)
             parts.append(f"in {folder.name}/ {', '.join(strange[:2])}{more} no photo's name")
     for base in _bases(group_dir, root):
-        parts += filter(None, (describe_export(path, image_path, base, group_dir) for path in list_exports(base)))
+        for folder in (base, *listing.subfolders(base, EXPORTS)):
+            xml = [str(path) for path in listing.entries(folder) if path.suffix.lower() == ".xml"]
+            parts += [f"{path} is not read (export as COCO, or as masks)" for path in xml]
+        seen = list_exports(base, listing)
+        parts += filter(None, (describe_export(path, image_path, base, group_dir, listing) for path in seen))
     return "; ".join([*parts, "`gift-peft prepare RAW OUT --propose-masks` draws first ones"])
 
 
@@ -177,52 +187,53 @@ def _bases(group_dir: Path, root: Path) -> list[Path]:
     return [group_dir, *(folder for folder in group_dir.parents if folder.is_relative_to(root))]
 
 
-def _own_files(image_path: Path, group_dir: Path, bases: Sequence[Path]) -> Iterator[Path]:
+def _own_files(image_path: Path, group_dir: Path, bases: Sequence[Path], listing: Listing) -> Iterator[Path]:
     """Where a file with this image's mask alone may be, most specific first."""
     within = image_path.relative_to(group_dir).parent
-    of_group = subfolders(group_dir, PICTURE_MASKS)
+    of_group = listing.subfolders(group_dir, PICTURE_MASKS)
     folders = list(
         dict.fromkeys(
-            [*subfolders(image_path.parent, PICTURE_MASKS), *(folder / within for folder in of_group), *of_group]
+            [
+                *listing.subfolders(image_path.parent, PICTURE_MASKS),
+                *(folder / within for folder in of_group),
+                *of_group,
+            ]
         )
     )
     for folder in folders:
-        yield from _called(folder, image_path, MASK_SUFFIXES)
+        yield from _called(listing, folder, image_path, MASK_SUFFIXES)
     for folder in (*folders, image_path.parent):
-        yield from _called(folder, image_path, MASK_SUFFIXES, "_mask")
-    for folder in (image_path.parent, *folders, *subfolders(group_dir, EXPORTS)):
-        yield from _called(folder, image_path, {".json"})
+        yield from _called(listing, folder, image_path, MASK_SUFFIXES, "_mask")
+    for folder in (image_path.parent, *folders, *listing.subfolders(group_dir, EXPORTS)):
+        yield from _called(listing, folder, image_path, {".json"})
     for base in bases:  # CVAT keeps the images' folders below its own, as they were uploaded
         start = image_path.parent if base == group_dir else group_dir.parent
         places = [image_path.parent.relative_to(folder) for folder in (base, start)]
-        for folder in (base, *subfolders(base, EXPORTS)):
+        for folder in (base, *listing.subfolders(base, EXPORTS)):
             pictures = folder / "SegmentationClass"
             if pictures.is_dir():
-                bare = base != group_dir and photo_names(base)[same_name(image_path.stem)] == 1
+                bare = base != group_dir and listing.photo_names(base)[same_name(image_path.stem)] == 1
                 for place in dict.fromkeys([*places, *([Path()] if bare else [])]):
-                    yield from _called(pictures / place, image_path, MASK_SUFFIXES)
+                    yield from _called(listing, pictures / place, image_path, MASK_SUFFIXES)
 
 
-def _called(folder: Path, photo: Path, suffixes: Collection[str], ending: str = "") -> list[Path]:
+def _called(listing: Listing, folder: Path, photo: Path, suffixes: Collection[str], ending: str = "") -> list[Path]:
     """The file of a folder that is called as the photo is, with `ending`: exactly, else in another case, else with the
     photo's whole name (`1.jpg.png`), unless another photo is called so; [] if there is none, ValueError if several.
     """
-    if not folder.is_dir():
-        return []
-    name, stem = same_name(photo.name).casefold(), same_name(photo.stem)
-    others = {same_name(path.stem) for path in photo.parent.iterdir() if path != photo and is_image_file(path)}
+    stem, name = same_name(photo.stem), same_name(photo.name)
     levels: tuple[list[Path], ...] = [], [], []
-    for path in sorted(folder.iterdir()):
-        given = same_name(path.stem)
-        if path == photo or path.suffix.lower() not in suffixes or is_leftover(path.name):
+    for path in listing.called(folder, stem + ending):
+        given = same_name(path.stem)[: len(stem)]
+        if path == photo or path.suffix.lower() not in suffixes:
             continue
-        if not given.casefold().endswith(ending):
-            continue
-        given = given[: len(given) - len(ending)]
         if given == stem:
             levels[0].append(path)
-        elif given not in others and given.casefold() in (stem.casefold(), name):
-            levels[1 + (given.casefold() == name)].append(path)
+        elif given not in listing.photo_stems(photo.parent):
+            levels[1].append(path)
+    for path in listing.called(folder, name + ending):
+        if path.suffix.lower() in suffixes and name not in listing.photo_stems(photo.parent):
+            levels[2].append(path)
     for found in filter(None, levels):
         found = [path for path in found if path.suffix == ".png"] or found
         if len(found) > 1:

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gift_peft.captures.clip import explain_clip, find_clips, read_time
-from gift_peft.captures.folders import files_below, holds_no_photos
+from gift_peft.captures.clip import explain_clip, find_clips
+from gift_peft.captures.folders import Listing, files_below, holds_no_photos
+from gift_peft.captures.group_facts import read_facts
 from gift_peft.captures.masks import (
     MaskSource,
     explain_missing,
@@ -27,7 +28,6 @@ from gift_peft.captures.masks import (
     is_group_mask,
     is_mask_file,
 )
-from gift_peft.files import read_yaml
 from gift_peft.images import (
     hidden_turn,
     image_digest,
@@ -37,13 +37,10 @@ from gift_peft.images import (
     read_image,
     skipped_files,
 )
-from gift_peft.rules import SPLITS, SURFACES, GroupPictures, check_count
+from gift_peft.rules import SPLITS, GroupPictures, check_count
 
 logger = logging.getLogger(__name__)
 
-GROUP_KEYS = {"surface", "notes", "mask_class", "empty_masks", "static_rig", "synthesized", "reference"}
-GROUP_FILES = ("group.yaml", "group.yml")
-EMPTY_MASKS = ("refuse", "allow")  # a photo without a target in a group whose others have one
 REFERENCE = re.compile(r"ref(erence)?([^a-z].*)?", re.IGNORECASE)  # but not reflection_1
 
 
@@ -184,7 +181,8 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
     if split == "validation" and "synthesized" in facts:
         raise ValueError(f"group {folder}: painted copies of one photo (gift-peft synthesize) are for training only")
     mask_class = facts.get("mask_class")
-    masks = [find_mask(path, folder, root, mask_class) for path in images]
+    listing = Listing()
+    masks = [find_mask(path, folder, root, mask_class, listing) for path in images]
     common = find_group_mask([path for path in files if is_group_mask(path)], images[0], root, mask_class)
     reference = references[0] if references else None
     return Capture(folder, folder.name, split, images, masks, reference, facts, common, skipped, root)
@@ -261,12 +259,17 @@ def _check_empty(capture: Capture, decoded: Decoded, empty_masks: str, may_lack:
     some = any(mask is not None and mask.any() for mask in shown)
     without = []
     for place, ((path, source), mask) in enumerate(zip(files, decoded.masks, strict=True)):
-        if (mask is not None and mask.any()) or (mask is None and (decoded.common is not None or may_lack)):
+        if mask is None and decoded.common is not None:  # an empty one is no stand-in for a target either
+            mask, source = decoded.common, capture.common or source
+            if mask.any() or not some:
+                continue
+        elif may_lack if mask is None else mask.any():
             continue
         if source is None:
             raise FileNotFoundError(explain_missing(path, capture.folder, capture.root or capture.folder))
-        without.append(f"{path.name} ({source.path.name})")
-        if mask is None:
+        inside = source.path.is_relative_to(capture.folder)
+        without.append(f"{path.name} ({capture.name(source.path) if inside else source.path.name})")
+        if decoded.masks[place] is None:
             decoded.masks[place] = np.zeros(decoded.images[place].size[::-1], bool)
     if empty_masks == "refuse" and without and (some or not all(source.annotated for _, source in files if source)):
         one = len(without) == 1
@@ -333,9 +336,14 @@ def _subfolders(folder: Path) -> list[Path]:
     folders = (
         path
         for path in folder.iterdir()
-        if not holds_no_photos(path.name) and (path.is_dir() or (path.is_symlink() and not path.exists()))
+        if not _is_no_group(path.name) and (path.is_dir() or (path.is_symlink() and not path.exists()))
     )
     return sorted(folders, key=lambda path: natural_key(path.name))
+
+
+def _is_no_group(folder: str) -> bool:
+    """Folders of exports lie beside groups; but a group may be called `mask`."""
+    return folder.casefold() != "mask" and holds_no_photos(folder)
 
 
 def _photos(files: list[Path], folder: Path) -> list[Path]:
@@ -356,33 +364,6 @@ def _has_reference(folder: Path) -> bool:
         return any(map(is_reference, (*_photos(files, folder), *unread))) or "reference" in read_facts(folder)
     except (OSError, ValueError):
         return False
-
-
-def read_facts(folder: Path) -> dict:
-    """What `group.yaml` says, {} without one; ValueError naming the file and what is wrong."""
-    found = [folder / name for name in GROUP_FILES if (folder / name).exists()]
-    if not found:
-        return {}
-    if len(found) > 1:
-        raise ValueError(f"{found[0]} and {found[1].name}: one of them is enough; remove the other")
-    path = found[0]
-    facts = read_yaml(path)
-    if not facts.keys() <= GROUP_KEYS:
-        raise ValueError(f"{path}: it may have the keys {', '.join(sorted(GROUP_KEYS))} and no others")
-    if facts.get("surface") not in (None, *SURFACES):
-        raise ValueError(f"{path}: surface {facts['surface']!r}; it is one of {', '.join(SURFACES)}")
-    classes = facts.get("mask_class", [])
-    if not all(isinstance(value, int | str) for value in (classes if isinstance(classes, list) else [classes])):
-        raise ValueError(f"{path}: mask_class {classes!r}; it is the target's value or label in the masks, or a list")
-    if facts.get("empty_masks", "refuse") not in EMPTY_MASKS:
-        raise ValueError(f"{path}: empty_masks {facts['empty_masks']!r}; it is one of {', '.join(EMPTY_MASKS)}")
-    if not isinstance(facts.get("static_rig", False), bool):
-        raise ValueError(f"{path}: static_rig {facts['static_rig']!r}; it is true or false")
-    if "reference" in facts:
-        read_time(facts["reference"], f"{path}: reference")
-    if not isinstance(facts.get("synthesized", {}), dict):
-        raise ValueError(f"{path}: synthesized {facts['synthesized']!r}; it is what gift-peft synthesize wrote there")
-    return facts
 
 
 def _mask_item(source: MaskSource | None, mask: np.ndarray) -> str | dict:

@@ -20,7 +20,7 @@ import safetensors.numpy
 import safetensors.torch
 
 from gift_peft.dataset.proxies import METADATA, mask_digests, picture_digests
-from gift_peft.dataset.rows import FORMAT_TYPE, RowRules
+from gift_peft.dataset.rows import RowRules
 from gift_peft.dataset.tensors import Group, resize_pictures, to_group
 from gift_peft.files import write_whole
 from gift_peft.models.pixels import pixel_settings
@@ -52,9 +52,9 @@ class GroupCache:
         self.processor = processor
         self.size = size
         self.folder = folder
-        rules = dataset.format["format_kwargs"].get("rules") or RowRules()
+        rules = RowRules.of(dataset) or RowRules()
         self._train, self._proxies, self._surface = rules.train, rules.proxies, rules.surface
-        self._groups = dataset.with_format(FORMAT_TYPE, rules=RowRules(rules.train, parsed=True))
+        self._groups = RowRules(rules.train, parsed=True).apply(dataset)
         self._stored = dataset.with_format("arrow")
         self._checked: dict[int, Path] = {}  # the entries that were found whole in this run
 

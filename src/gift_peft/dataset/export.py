@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from gift_peft.dataset.gift_i import FEATURES, gift_i_splits, load_gift_i
 from gift_peft.dataset.writer import CARD
-from gift_peft.files import whole_folder
+from gift_peft.files import check_replaceable, whole_folder
 
 # The pictures are compressed already; statistics of them would be whole small pictures once more, several times;
 # chunking by content lets a changed dataset upload only what changed.
@@ -64,7 +64,7 @@ def export_parquet(
     limit = _bytes(max_shard_size)
     if folder.is_relative_to(source) or folder.resolve().is_relative_to(source.resolve()):
         raise ValueError(f"{folder} is inside {source}, whose files it would join; give another folder")
-    _check_free(folder)
+    check_replaceable(folder)
     card = _source_card(source, license)
     with whole_folder(folder) as place:
         splits = datasets.SplitDict()
@@ -73,13 +73,7 @@ def export_parquet(
             content = _write_split(rows, split, place / "data", limit)
             splits.add(datasets.SplitInfo(split, num_bytes=content, num_examples=len(rows)))
         _complete_card(card, splits, place)
-        _check_free(folder)  # again: the shards took their time
     return folder
-
-
-def _check_free(folder: Path) -> None:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder} exists and is not an empty folder; delete it or give another")
 
 
 def _write_split(rows: datasets.Dataset, split: str, folder: Path, limit: int) -> int:

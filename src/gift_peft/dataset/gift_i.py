@@ -8,16 +8,13 @@ import glob
 import hashlib
 import os
 import re
-import shlex
-from collections import Counter
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import datasets
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from datasets import ClassLabel, Features, List, Value
 from datasets import Image as ImageFeature
 from datasets.builder import Key
@@ -25,12 +22,24 @@ from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
 from gift_peft.captures.tree import list_groups, raw_example
-from gift_peft.dataset.proxies import FORMAT, ProxyStore, SurfaceSettings, SurfaceStore, default_proxies_dir
-from gift_peft.dataset.rows import FORMAT_TYPE, IMAGE_COLUMNS, RowRules
-from gift_peft.files import is_hub_id, reason
-from gift_peft.images import image_digest, natural_key
-from gift_peft.models.identity import teacher_id, teacher_revision
-from gift_peft.rules import SPLITS, SURFACES, check_count, check_group_id
+from gift_peft.dataset.proxies import (
+    EARLIER,
+    FORMAT,
+    ProxyStore,
+    SurfaceSettings,
+    SurfaceStore,
+    default_proxies_dir,
+    has_earlier_set,
+    proxies_command,
+    stored_sizes,
+)
+from gift_peft.dataset.row_checks import check_rows
+from gift_peft.dataset.rows import RowRules
+from gift_peft.files import is_hub_id, is_leftover, reason
+from gift_peft.images import image_digest
+from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
+from gift_peft.models.pixels import pixel_settings
+from gift_peft.rules import SPLITS, SURFACES
 
 FEATURES = Features(
     {
@@ -140,13 +149,15 @@ def load_gift_i(
     weights and the decoded images. Slices, shuffles, selections and DataLoader workers keep them.
 
     Args:
-        path (`str` or `Path`): a prepared folder, a raw tree, a folder of parquet files, or a hub dataset id.
+        path (`str` or `Path`): a prepared folder, a raw tree, a folder of parquet files, what `save_to_disk` wrote, or
+            a hub dataset id.
         split (`str`): "train" or "validation", slices such as "train[:10]" included.
         teacher (`str` or `Path`, *optional*): the base model whose proxies to attach, a hub id or a folder.
         proxies_dir (`str` or `Path`, *optional*): where `gift-peft proxies` wrote them; default as it has it, the
             dataset's own `proxies` folder (see `default_proxies_dir`).
         revision (`str`, *optional*): of the teacher.
-        size (`tuple[int, int]`, *optional*): (h, w) that the proxies must have.
+        size (`tuple[int, int]`, *optional*): (h, w) of the proxies; default that of the set that is there, if it is
+            the only one.
         dataset_revision (`str`, *optional*): of a hub dataset.
         surface (`SurfaceSettings`, *optional*): with a teacher, attaches the surface targets made with these settings:
             accessed rows also have `surface_target` and `surface_target_flipped` (N, h, w), float32 tensors.
@@ -158,41 +169,35 @@ def load_gift_i(
     """
     dataset = _load_rows(path, split, dataset_revision, empty_masks)
     name = re.match(r"\w*", str(split)).group()
-    dataset = _check_rows(dataset, name, path)
+    dataset = check_rows(dataset, name, path, _picture_roots(path))
     rules = RowRules(train=name == "train")
     if teacher is not None:
         identity = teacher_id(teacher, revision)
         proxies = Path(proxies_dir) if proxies_dir else default_proxies_dir(path, identity)
         expected = {"format": FORMAT, "teacher": identity, "revision": teacher_revision(teacher, revision)}
-        if size is not None:
-            expected["size"] = f"{size[0]}x{size[1]}"
-        folder = str(proxies / identity / name)
-        command = partial(proxies_command, teacher, path, expected.get("size"), proxies_dir, revision)
-        rules = replace(rules, proxies=ProxyStore(folder, expected, command()))
+        if Path(teacher).is_dir():  # of a hub id the commit pins all
+            expected |= _expected_of_folder(teacher, has_earlier_set(proxies / identity))
+        wanted = None if size is None else f"{size[0]}x{size[1]}"
+        sizes = [wanted] if wanted else sorted(stored_sizes(proxies / identity, name))
+        if len(sizes) > 1:
+            raise ValueError(f"dataset {path}: proxies of {identity} at {' and '.join(sizes)}: give the size")
+        expected |= {"size": sizes[0]} if sizes else {}
+        command = partial(proxies_command, teacher, path, wanted, proxies_dir, revision)
+        place = (str(proxies / identity), expected.get("size", "<size>"), name)
+        rules = replace(rules, proxies=ProxyStore(*place, expected, command()))
         if surface is not None:
-            store = SurfaceStore(folder, expected | surface.header(), command(surface))
-            rules = replace(rules, surface=store)
-    return dataset.with_format(FORMAT_TYPE, rules=rules)
+            rules = replace(rules, surface=SurfaceStore(*place, expected | surface.header(), command(surface)))
+    return rules.apply(dataset)
 
 
-def proxies_command(
-    teacher, path, size=None, proxies_dir=None, revision=None, surface: SurfaceSettings | None = None
-) -> str:
-    """The shell command that makes these proxies, or surface targets."""
-    options = {
-        "--base": teacher,
-        "--dataset": path,
-        "--size": size,
-        "--proxies_dir": proxies_dir,
-        "--revision": revision,
-    }
-    if surface is not None:
-        options["--target"] = "surface"
-        for field in fields(surface):
-            value = getattr(surface, field.name)
-            options[f"--{field.name}"] = None if value == field.default else value
-    given = [part for option, value in options.items() if value is not None for part in (option, str(value))]
-    return shlex.join(["gift-peft", "proxies", *given])
+def _expected_of_folder(teacher: str | Path, earlier: bool) -> dict:
+    """What a proxy's header says of a teacher's folder besides its weights."""
+    from gift_peft.models.loading import load_processor
+
+    found = {EARLIER: earlier_revision(teacher)} if earlier else {}
+    if (Path(teacher) / "preprocessor_config.json").is_file():
+        found["processor"] = pixel_settings(load_processor(teacher))
+    return found
 
 
 def gift_i_splits(path: str | Path) -> list[str]:
@@ -200,6 +205,8 @@ def gift_i_splits(path: str | Path) -> list[str]:
     folder = Path(path)
     if not folder.is_dir():
         return [name for name in SPLITS if name in datasets.get_dataset_split_names(str(path))]
+    if saved := _saved_splits(folder):
+        return [name for name in SPLITS if name in saved]
     prepared = _prepared_splits(folder)
     if prepared or not _holds_parquet(folder):
         return prepared or list(list_groups(folder))
@@ -210,8 +217,29 @@ def _prepared_splits(folder: Path) -> list[str]:
     return [name for name in SPLITS if any((folder / name).glob("metadata.*"))]
 
 
+def _saved_splits(folder: Path) -> dict[str, datasets.Dataset]:
+    """What `Dataset.save_to_disk` or `DatasetDict.save_to_disk` left in a folder; empty for any other folder."""
+    if not any((folder / name).is_file() for name in ("state.json", "dataset_dict.json")):
+        return {}
+    saved = datasets.load_from_disk(str(folder))
+    return dict(saved) if isinstance(saved, datasets.DatasetDict) else {str(saved.split): saved}
+
+
+def _load_saved(saved: dict[str, datasets.Dataset], split: str, path: str | Path) -> datasets.Dataset:
+    """The rows of a split, or a slice of it, without what was added to them."""
+    _check_split(split, saved, path)
+    name = re.match(r"\w*", str(split)).group()
+    (part,) = datasets.ReadInstruction.from_spec(str(split)).to_absolute({name: len(saved[name])})
+    rows = saved[name].with_format(None)
+    if missing := FEATURES.keys() - rows.features.keys():
+        raise ValueError(f"dataset {path}: it lacks the column {min(missing)} of GIFT-I")
+    rows = rows.select_columns(list(FEATURES)).select(range(part.from_, part.to))
+    return rows if rows.features == FEATURES else rows.cast(FEATURES)
+
+
 def _holds_parquet(folder: Path) -> bool:
-    return any(folder.glob("*.parquet")) or any(folder.glob("*/*.parquet"))
+    found = (*folder.glob("*.parquet"), *folder.glob("*/*.parquet"))
+    return any(not any(map(is_leftover, path.relative_to(folder).parts)) for path in found)
 
 
 def _load_rows(path: str | Path, split: str, revision: str | None, empty_masks: str) -> datasets.Dataset:
@@ -222,6 +250,8 @@ def _load_rows(path: str | Path, split: str, revision: str | None, empty_masks: 
     try:
         if not folder.is_dir():
             return _load_from_hub(str(path), split, revision)
+        if saved := _saved_splits(folder):
+            return _load_saved(saved, split, path)
         if prepared := _prepared_splits(folder):
             # Named here, not left to the card: without one, `datasets` guesses splits from words in path names.
             # Escaped, because they are patterns, and a folder may be called "data [v2]".
@@ -263,58 +293,6 @@ def _check_split(split: str, present, path) -> None:
         raise ValueError(f"dataset {path}: no split {split!r}, only {', '.join(present)}")
 
 
-def _check_rows(dataset: datasets.Dataset, split: str, path) -> datasets.Dataset:
-    """Check all that needs no decoding; the dataset with images in natural order and none listed twice."""
-    counts = Counter(dataset["group_id"])
-    for group_id, count in counts.items():
-        check_group_id(group_id)
-        if count > 1:
-            raise ValueError(f"dataset {path}: {count} groups are called {group_id!r} in split {split}")
-    tables = dataset.with_format("arrow")
-    roots = _picture_roots(path)
-    keep = [_check_row(tables[index], split, roots) for index in range(len(dataset))]
-    if all(order == list(range(count)) for order, count in keep):
-        return dataset
-    stored = dataset.cast(_undecoded(dataset.features))
-    columns = ("image_names", *IMAGE_COLUMNS)
-    return stored.map(
-        lambda row, index: {key: [row[key][k] for k in keep[index][0]] for key in columns if row[key]},
-        with_indices=True,
-        features=stored.features,
-    ).cast(dataset.features)
-
-
-def _check_row(table: pa.Table, split: str, roots: list[str]) -> tuple[list[int], int]:
-    """Of one row: the images to keep, in natural order, and how many there are."""
-    group_id, names = table["group_id"][0].as_py(), table["image_names"][0].as_py() or []
-    for column in IMAGE_COLUMNS:
-        files = table[column][0].values
-        count = 0 if files is None else len(files)
-        if count != len(names) and (count or column in ("images", "masks")):
-            raise ValueError(f"group {group_id}: {len(names)} image names, but a list of {count} {column}")
-        _check_present(files, f"group {group_id}: missing {column.removesuffix('s')}", roots)
-    _check_present(table["reference"].combine_chunks(), f"group {group_id}: missing reference", roots)
-    contents = _contents(table["images"][0].values)
-    order = sorted(range(len(names)), key=lambda index: natural_key(names[index]))
-    first = {}
-    for index in order:
-        first.setdefault(contents[index], index)
-    check_count(group_id, len(first), split, table["reference"][0].is_valid)
-    return list(first.values()), len(names)
-
-
-def _check_present(files: pa.StructArray | None, missing: str, roots: list[str]) -> None:
-    files = None if files is None else files.drop_null()  # a null's fields may hold anything, an empty path for one
-    for file in [] if files is None else files.field("path").filter(files.field("bytes").is_null()).to_pylist():
-        if file is None:
-            continue
-        if not _is_inside(file, roots):
-            hint = "" if roots else "; in a parquet release the pictures are embedded (`gift-peft export`)"
-            raise ValueError(f"{missing.replace(': missing ', ', ')}: {file} is a path outside of the dataset{hint}")
-        if "://" not in file and not os.path.exists(file):
-            raise FileNotFoundError(f"{missing} {file}")
-
-
 def _picture_roots(path: str | Path) -> list[str]:
     """Where pictures may lie that a row names by path: whoever wrote the row shall not choose any file of ours."""
     folder = Path(path)
@@ -326,44 +304,13 @@ def _picture_roots(path: str | Path) -> list[str]:
     return [os.path.abspath(folder)]
 
 
-def _is_inside(file: str, roots: list[str]) -> bool:
-    place = file.rsplit("::", 1)[-1]  # of an archive's member, the archive
-    if "://" in place:
-        return "hf://" in roots and place.startswith("hf://")
-    return any(os.path.abspath(place).startswith(os.path.join(root, "")) for root in roots)
-
-
-def _contents(images: pa.StructArray) -> list:
-    """Something equal for equal files: a digest where sizes collide, else just the position."""
-    paths = images.field("path").to_pylist()
-    lengths = pc.binary_length(images.field("bytes")).to_pylist()
-    sizes = [
-        length if length is not None else path if "://" in path else os.path.getsize(path)
-        for path, length in zip(paths, lengths, strict=True)
-    ]
-    counts = Counter(sizes)
-    contents = []
-    for index, size in enumerate(sizes):
-        if counts[size] == 1 or isinstance(size, str):
-            contents.append(size if isinstance(size, str) else index)
-        else:
-            content = images.field("bytes")[index].as_py() or Path(paths[index]).read_bytes()
-            contents.append(hashlib.sha256(content).digest())
-    return contents
-
-
-def _undecoded(features: Features) -> Features:
-    plain = ImageFeature(decode=False)
-    return Features({**features, **dict.fromkeys(IMAGE_COLUMNS, List(plain)), "reference": plain})
-
-
 def dataset_fingerprint(dataset: datasets.Dataset) -> str:
     """32 hex digits of what a dataset holds: every group's names, image contents, masks and reference.
 
     The same for raw tree, prepared folder and parquet of the same groups, and for any order of the groups.
     """
     digests = []
-    groups = dataset.with_format(FORMAT_TYPE, rules=RowRules(parsed=True))
+    groups = RowRules(parsed=True).apply(dataset)
     for group in tqdm(groups, desc="reading the dataset", unit="group", delay=2):
         digest = hashlib.sha256(group.group_id.encode())
         for name, image, mask in zip(group.names, group.images, group.masks, strict=True):

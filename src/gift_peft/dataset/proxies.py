@@ -1,8 +1,9 @@
 """Proxy files: what the frozen teacher predicts for a group, and everything needed to know that it still holds.
 
-`proxies/<teacher>/<split>/<group_id>.safetensors` holds `proxies` (N, h, w) float32 in image order and, where the
-group has a treated reference, `reference` (h, w). The header names the teacher, its revision, the size, the image
-processor's settings and a digest of every image's decoded content: a proxy of other weights or pixels is never used.
+`proxies/<teacher>/<h>x<w>/<split>/<group_id>.safetensors` holds `proxies` (N, h, w) float32 in image order and, where
+the group has a treated reference, `reference` (h, w): sets of several sizes lie side by side. The header names the
+teacher, its revision, the size, the image processor's settings and a digest of every image's decoded content: a proxy
+of other weights or pixels is never used. Sets of 0.1.0, which lie one folder higher, are read where their size fits.
 
 `<group_id>.surface.safetensors` beside it holds the surface targets, `target` and `target_flipped` (N, h, w) float32,
 the second in the orientation of the flipped photo. Its header states that besides the masks and how it was made.
@@ -13,8 +14,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
+import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +26,7 @@ import safetensors
 
 from gift_peft.files import reason, write_whole
 from gift_peft.images import image_digest
-from gift_peft.rules import GroupPictures
+from gift_peft.rules import SPLITS, GroupPictures
 from gift_peft.surface_targets import MODELS, RULE
 
 if TYPE_CHECKING:
@@ -33,10 +36,17 @@ FORMAT = "gift-peft proxies 1"
 SURFACE_FORMAT = "gift-peft surface targets 1"
 METADATA = "gift_peft"
 SURFACE_SUFFIX = ".surface"
+EARLIER = "earlier_revision"  # expected of files of 0.1.0 in place of the revision; never written
+TOLD = "told"  # of a surface target's header: what `evaluation.surface_check.describe` knows; never compared
 # What a header says apart from pixels, in the order in which differences are told, and in words where those differ.
 STATED = ("format", "teacher", "revision", "size", "processor", "kind", "rule")
 STATED += ("fills", "seed", "surface_model", "surface_quantile", "surface_tau")
 IN_WORDS = {"revision": "model or revision", "processor": "image processor"}
+# Whether there are fills: measured in docs/surface-targets.md.
+LEVELS = {
+    True: {"surface_quantile": 0.65, "surface_tau": 0.5},
+    False: {"surface_quantile": 0.8, "surface_tau": 0.7},
+}
 
 
 @dataclass(frozen=True)
@@ -47,7 +57,8 @@ class SurfaceSettings:
         fills (`int`): copies of each photo with its target painted, predicted beside it; 0 is allowed.
         seed (`int`): of the fills' colors.
         surface_model (`str`): "auto", "plane" or "quantile", as `surface_target` takes it.
-        surface_quantile, surface_tau (`float`): levels of the two models; higher is nearer.
+        surface_quantile, surface_tau (`float`, *optional*): levels of the two models; higher is nearer. Default 0.65
+            and 0.5 with fills, which show the surface; 0.8 and 0.7 without, where what lies behind has most votes.
 
     Raises:
         ValueError: a value out of range.
@@ -56,14 +67,17 @@ class SurfaceSettings:
     fills: int = 6
     seed: int = 0
     surface_model: str = "auto"
-    surface_quantile: float = 0.8
-    surface_tau: float = 0.7
+    surface_quantile: float | None = None
+    surface_tau: float | None = None
 
     def __post_init__(self) -> None:
         if self.fills < 0 or self.seed < 0:
             raise ValueError(f"fills and seed: must not be negative, got {self.fills} and {self.seed}")
         if self.surface_model not in MODELS:
             raise ValueError(f"surface_model {self.surface_model!r}: it is one of {', '.join(MODELS)}")
+        for name, level in LEVELS[self.fills > 0].items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, level)  # the only way in a frozen dataclass
         if not 0 <= self.surface_quantile <= 1:
             raise ValueError(f"surface_quantile: must lie from 0 to 1, got {self.surface_quantile}")
         if not 0 < self.surface_tau < 1:
@@ -90,6 +104,28 @@ def default_proxies_dir(dataset: str | Path, teacher: str) -> Path:
         resolved = str(folder.resolve())
         slug = f"{folder.resolve().name}-{hashlib.sha256(resolved.encode()).hexdigest()[:12]}"
     return Path(HF_HOME) / "gift-peft" / "proxies" / slug
+
+
+def proxies_command(
+    teacher, path, size=None, proxies_dir=None, revision=None, surface: SurfaceSettings | None = None
+) -> str:
+    """The shell command that makes these proxies, or surface targets."""
+    options = {
+        "--base": teacher,
+        "--dataset": path,
+        "--size": size,
+        "--proxies_dir": proxies_dir,
+        "--revision": revision,
+    }
+    if surface is not None:
+        options["--target"] = "surface"
+        defaults = SurfaceSettings(surface.fills)
+        for field in fields(surface):
+            value = getattr(surface, field.name)
+            default = field.default if field.name == "fills" else getattr(defaults, field.name)
+            options[f"--{field.name}"] = None if value == default else value
+    given = [part for option, value in options.items() if value is not None for part in (option, str(value))]
+    return shlex.join(["gift-peft", "proxies", *given])
 
 
 def write_proxies(path: Path, header: dict, proxies: torch.Tensor, reference: torch.Tensor | None) -> None:
@@ -158,6 +194,8 @@ def read_header(path: Path, command: str = "gift-peft proxies", what: str = "pro
 def difference(header: dict, expected: dict, names: Sequence[str]) -> str | None:
     """In words, the first way in which a header is not the expected one; None if it is."""
     for key in STATED:
+        if key == "revision" and header.get(key) == expected.get(EARLIER, ""):
+            continue
         if key in expected and header.get(key) != expected[key]:
             return f"it was made with {IN_WORDS.get(key, key)} {header.get(key)}, not {expected[key]}"
     made, now = header.get("images", []), expected["images"]
@@ -176,19 +214,54 @@ def difference(header: dict, expected: dict, names: Sequence[str]) -> str | None
     return None
 
 
+def stored_sizes(folder: Path, split: str) -> set[str]:
+    """The sizes ("<h>x<w>") of the sets of one teacher, whose folder this is, that have files of a split."""
+    found = {path.name for path in folder.glob("*x*") if re.fullmatch(r"\d+x\d+", path.name)}
+    found = {size for size in found if any((folder / size / split).glob("*.safetensors"))}
+    return found | {_stated_size(path) for path in list((folder / split).glob("*.safetensors"))[:1]} - {""}
+
+
+def has_earlier_set(folder: Path) -> bool:
+    """Whether 0.1.0 has made proxies of the teacher whose folder this is."""
+    return any((folder / split).is_dir() for split in SPLITS)
+
+
+def _stated_size(path: Path) -> str:
+    """What a file's header says; "" for one that is damaged or none of ours."""
+    try:
+        return str(read_header(path).get("size", ""))
+    except (ValueError, AttributeError):
+        return ""
+
+
 @dataclass(frozen=True)
 class ProxyStore:
     """The proxies of one split and teacher; reads one group at a time and checks it before handing it out.
 
     Args:
-        folder (`str`): `proxies/<teacher>/<split>`.
-        expected (`dict`): header entries known beforehand: format, teacher, revision and perhaps size.
+        teacher_folder (`str`): `proxies/<teacher>`.
+        size (`str`): "<h>x<w>".
+        split (`str`).
+        expected (`dict`): header entries known beforehand: format, teacher, revision; and of sets of 0.1.0
+            `earlier_revision`.
         command (`str`): the shell command that makes these proxies, for messages.
     """
 
-    folder: str
+    teacher_folder: str
+    size: str
+    split: str
     expected: dict
     command: str
+
+    def path(self, file: str) -> Path:
+        """Where a file is, or belongs if it is not there."""
+        place, earlier = self.place(file), Path(self.teacher_folder) / self.split / file
+        old = not place.exists() and earlier.exists() and _stated_size(earlier) == self.size
+        return earlier if old else place
+
+    def place(self, file: str) -> Path:
+        """Where a file belongs."""
+        return Path(self.teacher_folder) / self.size / self.split / file
 
     def read(self, group_id: str, names: Sequence[str], digests: dict) -> tuple[torch.Tensor, torch.Tensor | None]:
         """(proxies (N, h, w), reference (h, w) or None), float32, of a group with these `picture_digests`.
@@ -209,7 +282,7 @@ class ProxyStore:
         part: slice = slice(None),
     ) -> dict[str, torch.Tensor]:
         """The tensors of a file, checked; of the columns, which have an entry per image, only this part."""
-        path = Path(self.folder) / file
+        path = self.path(file)
         if not path.exists():
             raise FileNotFoundError(f"missing {what} {path}; make it with `{self.command}`")
         header, again = read_header(path, self.command, what), f"make it again with `{self.command} --overwrite`"

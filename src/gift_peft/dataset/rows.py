@@ -5,7 +5,7 @@ DataLoader workers), only the rows that are accessed are decoded, and a damaged 
 the decoding of the `Image` feature alone does not give.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import datasets
@@ -25,7 +25,7 @@ IMAGE_COLUMNS = ("images", "masks", "valids", "depths")
 
 @dataclass(frozen=True)
 class RowRules:
-    """How rows are read. Unpickling a dataset elsewhere imports this module, and with it the formatter.
+    """How rows are read.
 
     Args:
         train (`bool`): some mask of a group must have a target.
@@ -39,19 +39,42 @@ class RowRules:
     surface: SurfaceStore | None = None
     parsed: bool = False
 
+    @classmethod
+    def of(cls, rows: Any) -> "RowRules | None":
+        """Those of rows of `load_gift_i`; None of any other rows."""
+        stated = rows.format["format_kwargs"].get("rules") if isinstance(rows, datasets.Dataset) else None
+        return None if stated is None else cls.from_json(stated)
+
+    @classmethod
+    def from_json(cls, stated: dict) -> "RowRules":
+        stores = {"proxies": ProxyStore, "surface": SurfaceStore}
+        found = {name: kind(**stated[name]) for name, kind in stores.items() if stated.get(name) is not None}
+        return cls(**{**stated, **found})
+
+    def apply(self, rows: datasets.Dataset) -> datasets.Dataset:
+        """The rows, read under these rules."""
+        return rows.with_format(FORMAT_TYPE, rules=StatedRules(asdict(self)))
+
+
+class StatedRules(dict):
+    """Rules in JSON types, or `Dataset.save_to_disk` could not write them.
+
+    Unpickling a dataset elsewhere imports this module for it, and with it the formatter.
+    """
+
 
 def parsed(rows: Any) -> Any:
     """Rows of `load_gift_i`, read as `GroupPictures` in place of dicts; any other rows as they are."""
-    rules = rows.format["format_kwargs"].get("rules") if isinstance(rows, datasets.Dataset) else None
-    return rows if rules is None else rows.with_format(FORMAT_TYPE, rules=replace(rules, parsed=True))
+    rules = RowRules.of(rows)
+    return rows if rules is None else replace(rules, parsed=True).apply(rows)
 
 
 class GiftIFormatter(Formatter):
     """Rows of GIFT-I, read under `rules`."""
 
-    def __init__(self, rules: RowRules, features=None, token_per_repo_id=None):
+    def __init__(self, rules: dict, features=None, token_per_repo_id=None):
         super().__init__(features=features, token_per_repo_id=token_per_repo_id)
-        self.rules = rules
+        self.rules = RowRules.from_json(rules)
 
     def format_row(self, pa_table: pa.Table) -> dict | GroupPictures:
         return self._row(self.python_arrow_extractor().extract_row(pa_table))

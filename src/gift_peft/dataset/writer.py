@@ -34,6 +34,7 @@ SCHEMA = pa.schema(
     ]
 )
 
+GROUP_FILES = ("images/*", "masks/*", "valids/*", "depths/*", "reference.*")  # what a group's folder holds
 CARD = """---
 license: {license}
 pretty_name: {pretty_name}
@@ -155,7 +156,7 @@ def write_group(group: dict, root: Path) -> dict:
     stems = [f"{index:02d}_{re.sub(r'[^A-Za-z0-9_.-]', '_', Path(name).stem)}" for index, name in enumerate(names)]
     parts = {"images": group["images"], **{kind: getattr(pictures, kind) for kind in ("masks", "valids", "depths")}}
     row = {"group_id": group_id, "surface": surface, "image_names": names}
-    with whole_folder(root / split / group_id) as folder:
+    with whole_folder(root / split / group_id, GROUP_FILES) as folder:
         for kind, items in parts.items():
             files = [_save(item, folder / kind / stem) for item, stem in zip(items, stems, strict=False)]
             row[f"{kind}_file_names"] = [f"{group_id}/{kind}/{file}" for file in files]

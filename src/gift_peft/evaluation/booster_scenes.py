@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gift_peft.files import reason
+from gift_peft.files import is_leftover, reason
 from gift_peft.images import SINGLE_CHANNEL, natural_key, open_image, sort_pictures, to_mask
 
 SUBSETS = ("balanced", "unbalanced")
@@ -191,7 +191,7 @@ def _holds_scenes(folder: Path) -> bool:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    folders = (path for path in folder.iterdir() if path.is_dir() and not path.name.startswith((".", "__")))
+    folders = (path for path in folder.iterdir() if path.is_dir() and not is_leftover(path.name))
     return sorted(folders, key=lambda path: natural_key(path.name))
 
 

@@ -96,6 +96,8 @@ def notes(report: Report) -> list[str]:
         )
     if consensus_teaches(report) is False:
         lines.append(NO_TEACHING)
+    if report.unit == "mm":
+        lines.append(f"{report.gce_name} is in the model's own units, not in mm.")
     return [*lines, protocol_note(report), skipped_note(report)]
 
 

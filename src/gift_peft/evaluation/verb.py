@@ -1,5 +1,6 @@
 """`gift-peft evaluate`: load, evaluate, print the table, leave the files."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,14 +28,15 @@ def run_evaluation(
     kind: str | None = None,
     revision: str | None = None,
     device: str | None = None,
+    accept_base: bool = False,
     color: bool = False,
     **options: Any,
 ) -> "Report":
     """`gift-peft evaluate`: loads, evaluates, prints the table, writes `metrics.json`, `rows.jsonl`, `report.md`.
 
     Args:
-        base, adapter, adapter_scale, revision, size, kind, device: as in `DepthModel.from_pretrained`; `base` is None
-            where stored `predictions` stand in for it.
+        base, adapter, adapter_scale, revision, size, kind, device, accept_base: as in `DepthModel.from_pretrained`;
+            `base` is None where the adapter names it, or stored `predictions` stand in for it.
         dataset, split, dataset_revision: of GIFT-I, as in `load_gift_i`; or `booster`, the root of Booster.
         out: folder of the files.
         color: of the table printed.
@@ -44,15 +46,19 @@ def run_evaluation(
     from gift_peft.evaluation.booster_scenes import find_booster
     from gift_peft.evaluation.evaluate import evaluate_booster, evaluate_gift_i
     from gift_peft.evaluation.tables import markdown_table, text_table
+    from gift_peft.models.adapter_base import find_base
     from gift_peft.models.loading import DepthModel
 
+    _check_place(Path(out))
     if booster:  # fail early: large weights take minutes to load
         get_protocol(options.get("protocol", "gift"))
         find_booster(booster, options.get("subset"), options.get("official"))
+    if base is None and adapter is not None:
+        base, revision = find_base(None, adapter, revision)
     model = (
         None
         if base is None
-        else DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device)
+        else DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
     )
     if booster:
         report = evaluate_booster(booster, model, predictions, kind if model is None else None, **options)
@@ -76,6 +82,20 @@ def run_evaluation(
     print(text_table(report, color=color))
     print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
     return report
+
+
+def _check_place(folder: Path) -> None:
+    """Raise ValueError if the folder's files of these names are not those of an evaluation."""
+    there = [name for name in ("metrics.json", "rows.jsonl", "report.md") if (folder / name).exists()]
+    try:
+        first = (folder / ("metrics.json" if "metrics.json" in there else "rows.jsonl")).read_text(encoding="utf-8")
+        known = json.loads(first if "metrics.json" in there else first.partition("\n")[0]).keys()
+    except (OSError, ValueError, AttributeError):
+        known = set()
+    if there and not (known >= {"protocol", "summary"} or known >= {"group_id", "image"}):
+        raise ValueError(
+            f"--out {folder}: its {', '.join(there)} is of no evaluation and is kept; name another folder"
+        )
 
 
 def make_parser() -> OptionParser:
@@ -114,8 +134,8 @@ def run(argv: Sequence[str]) -> int:
         return 0
     if (args.dataset is None) == (args.booster is None):
         parser.error("one of --dataset and --booster is required")
-    if (args.base is None) == (args.predictions is None):
-        parser.error("one of --base and --predictions is required")
+    if (args.base is None and args.adapter is None) == (args.predictions is None):
+        parser.error("one of --base, --adapter and --predictions is required")
     if args.predictions and (args.dataset or args.adapter):
         parser.error("--predictions go with --booster, and without --adapter")
     options: dict[str, Any] = {"prediction_scale": args.prediction_scale, "color": use_color()}
@@ -137,6 +157,7 @@ def run(argv: Sequence[str]) -> int:
         size=args.size,
         kind=args.kind,
         revision=args.revision,
+        accept_base=args.accept_base,
         **options,
     )
     return 0

@@ -11,7 +11,7 @@ from huggingface_hub.errors import StrictDataclassError
 from safetensors import SafetensorError
 from transformers import PreTrainedConfig
 
-from gift_peft.files import is_hub_id, whole_folder
+from gift_peft.files import check_replaceable, is_hub_id, whole_folder
 from gift_peft.models.metric3d import Metric3DConfig, Metric3DForDepthEstimation, Metric3DImageProcessorPil
 from gift_peft.models.vggt import VggtConfig, VggtForDepthEstimation, VggtImageProcessorPil
 
@@ -52,7 +52,7 @@ CONVERTERS = {"vggt": convert_vggt, "metric3d": convert_metric3d}
 
 def _fetch(source: str | Path, default: str, folder: str | Path) -> Path:
     """The local file of `source`, downloaded if it is on the hub; after a look at `folder`, which costs less."""
-    _check_free(Path(folder))
+    check_replaceable(Path(folder))
     path, parts = Path(source), str(source).split("/")
     repository, file = "/".join(parts[:2]), "/".join(parts[2:]) or default
     a_file_here = len(parts) < 3 and path.suffix in (".safetensors", ".pt", ".pth")
@@ -68,11 +68,6 @@ def _fetch(source: str | Path, default: str, folder: str | Path) -> Path:
         raise FileNotFoundError(
             f"{source}: no such file, and {file} of {repository} does not come from the hub ({reason})"
         ) from None
-
-
-def _check_free(folder: Path) -> None:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder} already exists: name a new folder")
 
 
 def _read_config(config_class: type[PreTrainedConfig], path: str | Path) -> PreTrainedConfig:
@@ -91,7 +86,6 @@ def _convert(model_class: type[Any], processor: Any, source: Path, folder: str |
         with whole_folder(folder) as temporary:
             model.save_pretrained(temporary)
             processor.save_pretrained(temporary)
-            _check_free(folder)  # again: conversion takes minutes
     except SafetensorError as error:  # a full disk, which is no OSError there
         raise OSError(f"{folder}: the weights cannot be written ({error})") from None
     return folder

@@ -23,7 +23,8 @@ from torch import nn
 
 from gift_peft.files import reason
 from gift_peft.images import read_image
-from gift_peft.models.identity import check_base_name, teacher_revision
+from gift_peft.models.adapter_base import check_base, find_base
+from gift_peft.models.identity import adapter_as_base, check_base_name
 from gift_peft.models.pixels import resolve_size, to_pixel_values
 from gift_peft.rules import KINDS
 
@@ -91,18 +92,20 @@ class DepthModel:
     @classmethod
     def from_pretrained(
         cls,
-        base: str | Path,
+        base: str | Path | None = None,
         adapter: str | Path | None = None,
         adapter_scale: float | None = None,
         revision: str | None = None,
         size: str | tuple[int, int] | None = None,
         kind: str | None = None,
         device: str | torch.device | None = None,
+        accept_base: bool = False,
     ) -> "DepthModel":
         """A base model, with an adapter if one is named.
 
         Args:
             base: folder or hub id; or `da3:<id>`, `moge:<id>` for a model of those packages, which takes no adapter.
+                Default: the one that the adapter names, sought beside the adapter too.
             adapter (*optional*): folder or hub id in PEFT format.
             adapter_scale (`float`, *optional*): 0 is the base, 1 the adapter, to the bit.
             revision (`str`, *optional*): of the base.
@@ -110,10 +113,11 @@ class DepthModel:
                 the image processor's.
             kind (`str`, *optional*): `depth` or `inverse_depth`; default the recipe's, else the adapter's.
             device (*optional*): default CUDA where there is one.
+            accept_base (`bool`): warn where the adapter was made for another base, in place of refusing it.
 
         Raises:
             FileNotFoundError: no model or adapter at that place.
-            ValueError: the adapter was made for another base, or no size is known.
+            ValueError: the adapter was made for another base, no base or no size is known.
         """
         from gift_peft.adapters.folder import read_gift
         from gift_peft.adapters.scale import set_adapter_scale
@@ -121,14 +125,18 @@ class DepthModel:
 
         if adapter is None and adapter_scale is not None:
             raise ValueError("adapter_scale needs an adapter")
-        if split_external(base):
+        if base is None and adapter is None:
+            raise ValueError("a base model or an adapter is needed")
+        if base is not None and split_external(base):
             if adapter is not None:
                 raise ValueError(f"base {base}: an adapter needs a model of transformers")
             network, processor = load_external(base)
         else:
-            network, processor = load_base(base, revision)
+            if adapter is not None:
+                base, revision = find_base(base, adapter, revision)
+            network, processor = load_base(base, revision, with_processor=not _brings_processor(adapter))
         if adapter is not None:
-            network, processor = _attach(network, processor, base, adapter, revision)
+            network, processor = _attach(network, processor, base, adapter, revision, accept_base)
             kind = kind or _stated_kind(network) or read_gift(adapter).get("kind")
             if adapter_scale is not None:
                 set_adapter_scale(network, adapter_scale)
@@ -294,10 +302,11 @@ def _stated_kind(network: Any) -> str | None:
 # ---- from a folder or the hub ----
 
 
-def load_base(base: str | Path, revision: str | None = None) -> tuple[Any, Any]:
-    """(model in float32 and eval mode, image processor) of a hub id or folder.
+def load_base(base: str | Path, revision: str | None = None, with_processor: bool = True) -> tuple[Any, Any]:
+    """(model in float32 and eval mode, image processor) of a hub id or folder; the processor is None if not asked for.
 
-    Raises FileNotFoundError where there is none, ValueError for weights that do not fit or are damaged.
+    Raises FileNotFoundError where there is none, ValueError for an adapter, and for weights that do not fit or are
+    damaged.
     """
     from safetensors import SafetensorError
     from transformers import AutoModelForDepthEstimation
@@ -306,7 +315,7 @@ def load_base(base: str | Path, revision: str | None = None) -> tuple[Any, Any]:
     options = {"revision": revision, "trust_remote_code": False}  # no question on the terminal, no foreign code
     try:
         model = AutoModelForDepthEstimation.from_pretrained(base, dtype=torch.float32, **options)
-        return model.eval(), load_processor(base, revision)
+        processor = load_processor(base, revision) if with_processor else None
     except OSError as error:
         raise FileNotFoundError(f"base model {base}: {reason(error)}") from error
     except pickle.UnpicklingError:
@@ -315,6 +324,9 @@ def load_base(base: str | Path, revision: str | None = None) -> tuple[Any, Any]:
         ) from None
     except (ValueError, RuntimeError, SafetensorError) as error:  # of another shape, cut off, no tensors
         raise ValueError(f"base model {base}: {reason(error)}") from error
+    if getattr(model, "peft_config", None):  # transformers loads the base of an adapter by itself
+        raise adapter_as_base(base)
+    return model.eval(), processor
 
 
 def load_processor(source: str | Path, revision: str | None = None) -> Any:
@@ -324,7 +336,13 @@ def load_processor(source: str | Path, revision: str | None = None) -> Any:
     return AutoImageProcessor.from_pretrained(source, revision=revision, backend="pil", trust_remote_code=False)
 
 
-def _attach(model, processor, base, adapter, revision):
+def _brings_processor(adapter: str | Path | None) -> bool:
+    from gift_peft.adapters.folder import PROCESSOR_CONFIG
+
+    return adapter is not None and (Path(adapter) / PROCESSOR_CONFIG).is_file()
+
+
+def _attach(model, processor, base, adapter, revision, accept_base):
     """The PeftModel and its image processor; one clear error if the adapter belongs to another base."""
     from peft import PeftModel
     from safetensors import SafetensorError
@@ -332,7 +350,7 @@ def _attach(model, processor, base, adapter, revision):
     from gift_peft.adapters.folder import ADAPTER_WEIGHTS, PROCESSOR_CONFIG, read_adapter_config
 
     made_for = read_adapter_config(adapter).base_model_name_or_path
-    _check_base(base, revision, adapter, made_for)
+    check_base(base, revision, adapter, made_for, accept_base)
     mismatch = f"adapter {adapter} does not fit base {base}: it was trained on {made_for}"
     with warnings.catch_warnings():
         # peft 0.21 reads an attribute that transformers 5.23 deprecates, and only warns of weights it did not find.
@@ -351,21 +369,3 @@ def _attach(model, processor, base, adapter, revision):
             raise ValueError(f"adapter {adapter}: damaged {PROCESSOR_CONFIG} ({reason(error)})") from None
         # An adapter that PEFT alone saved: the base's processor serves.
     return model, processor
-
-
-def _check_base(base, revision, adapter, made_for: str | None) -> None:
-    """ValueError unless the adapter was trained on this base, as far as weights and names tell.
-
-    Two folders are compared by the digest in gift.json (without it, of the folder named, if that is still there), two
-    hub ids by name. A folder on one side and a hub id on the other may be copies of one model: then shapes decide.
-    """
-    from gift_peft.adapters.folder import read_gift
-
-    trained, present = read_gift(adapter).get("base_revision") or "", teacher_revision(base, revision)
-    if not trained and made_for and (Path(made_for) / "config.json").is_file():
-        trained = teacher_revision(made_for)
-    was_folder, is_folder = (pin.startswith("sha256:") for pin in (trained, present))
-    if was_folder and is_folder and trained != present:
-        raise ValueError(f"adapter {adapter} was trained on {made_for}, whose files are not those of base {base}")
-    if made_for not in (None, str(base)) and not was_folder and not is_folder and not Path(made_for).exists():
-        raise ValueError(f"adapter {adapter} was trained on {made_for}, not on base {base}")

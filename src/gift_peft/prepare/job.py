@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gift_peft.captures.foreign import Layout
-from gift_peft.captures.tree import GROUP_FILES, Capture, read_capture
+from gift_peft.captures.group_facts import GROUP_FILES
+from gift_peft.captures.tree import Capture, read_capture
 from gift_peft.prepare.entries import Remark
 from gift_peft.prepare.settings import PrepareSettings
 

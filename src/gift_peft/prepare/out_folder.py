@@ -3,6 +3,7 @@
 Such a command keeps a hidden folder in OUT: by it, it knows OUT as its own, and the lock of the run at work is in it.
 """
 
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -13,6 +14,10 @@ from typing import TypeVar
 
 import cv2
 from filelock import FileLock, Timeout
+
+from gift_peft.files import write_whole
+
+CARD, CARD_NOTE = "README.md", "card"
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -43,6 +48,28 @@ def alone(verb: str, out: Path, state: str) -> Iterator[None]:
             yield
     except Timeout:
         raise ValueError(f"OUT {out}: another gift-peft {verb} is at work there; wait for it") from None
+
+
+def check_card(verb: str, out: Path, state: str) -> None:
+    """Raise ValueError if OUT's card was edited by hand since the command wrote it."""
+    card, note = out / CARD, out / state / CARD_NOTE
+    if card.is_file() and note.is_file() and note.read_text(encoding="utf-8") != _digest(card):
+        raise ValueError(
+            f"{card}: changed since gift-peft {verb} wrote it, and it would be replaced; move it away, run again, and "
+            "bring your changes to the new one"
+        )
+
+
+def note_card(out: Path, state: str) -> None:
+    """Note what the card is as the command has written it (or that there is none)."""
+    if (out / CARD).is_file():
+        write_whole(out / state / CARD_NOTE, _digest(out / CARD))
+    else:
+        (out / state / CARD_NOTE).unlink(missing_ok=True)
+
+
+def _digest(path: Path) -> str:
+    return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 
 def side_by_side(

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from gift_peft.files import write_whole
 from gift_peft.images import jpeg_uri, open_image
+from gift_peft.prepare.quality import plain_number
 
 WIDTH = 240  # of the thumbnails as they are shown, in pixels
 LARGEST = 960  # of a picture in the file, which is shown when it is clicked
@@ -274,7 +275,7 @@ def _figures(frames: list[dict]) -> str:
         cells += [_verdict(found.get("paper_exact"))] if exact else []
         rows.append([frame["name"], *cells, *(_measured(key, quality.get(key)) for key in measured)])
     head = ["frame", *(heading for heading, _ in FIGURES.values()), *(["the paper's rule alone"] if exact else [])]
-    head += [f"{QUALITY[key][0]}{' (%)' if QUALITY[key][1] == '%' else ''}" for key in measured]
+    head += [QUALITY[key][0] for key in measured]
     meanings = " · ".join(f"<b>{_text(word)}</b>: {_text(meaning)}" for word, meaning in MEANINGS.items())
     return f'<details><summary>Figures</summary>{_table(head, rows)}<p class="facts">{meanings}</p></details>'
 
@@ -374,16 +375,15 @@ def _number(value, form: str = ".3g") -> str:
         return "–"
     if not isinstance(value, int | float) or form == "s":
         return str(value)
-    text = format(round(value) if form == "d" else value, form)
-    if "e" in text:
-        text = f"{value:.0f}" if abs(value) >= 1 else f"{value:.6f}".rstrip("0").rstrip(".")
-    return text
+    return plain_number(value) if form == ".3g" else format(round(value) if form == "d" else value, form)
 
 
 def _measured(key: str, value: float | None) -> str:
     """A figure of quality in its unit."""
-    form = QUALITY[key][1]
-    return _number(value, form) if form != "%" or value is None else f"{_number(100 * value)} %"
+    unit = QUALITY[key][1]
+    if value is None or unit.startswith("."):
+        return _number(value, unit)
+    return f"{_number(100 * value)} %" if unit == "%" else f"{_number(value, '.1f')} {unit}"
 
 
 def _text(value) -> str:

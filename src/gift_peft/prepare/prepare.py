@@ -19,17 +19,17 @@ from tqdm import tqdm
 
 from gift_peft.captures.tree import find_groups
 from gift_peft.dataset.writer import write_card, write_rows
-from gift_peft.files import write_whole
+from gift_peft.files import remove_files, strangers, write_whole
 from gift_peft.options import package_version
 from gift_peft.prepare.clip_groups import replace_clips
 from gift_peft.prepare.entries import Statistics
 from gift_peft.prepare.frame_bar import FrameBar
 from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import FORMAT, Job, Outcome
-from gift_peft.prepare.out_folder import alone, check_places, side_by_side
+from gift_peft.prepare.out_folder import alone, check_card, check_places, note_card, side_by_side
 from gift_peft.prepare.page import write_html
 from gift_peft.prepare.settings import PrepareSettings
-from gift_peft.rules import SPLITS
+from gift_peft.rules import MAX_GROUP_ID, SPLITS
 
 STATE = ".prepare"  # in OUT: one record per finished group, and groups on their way
 
@@ -57,8 +57,10 @@ def prepare_gift_i(
         license, pretty_name (`str`): for the dataset card.
 
     Raises:
-        ValueError, FileNotFoundError: one line; `raw` or `out` is not what it should be, or another run is at work
-            in `out`. What concerns one group never raises.
+        ValueError, FileNotFoundError: one line; `raw` or `out` is not what it should be, another run is at work in
+            `out`, or a group or the card would replace a file there that this function did not write, or that was
+            changed since.
+            What concerns one group of `raw` never raises.
     """
     raw, out = Path(raw), Path(out)
     settings = settings or PrepareSettings()
@@ -67,6 +69,7 @@ def prepare_gift_i(
     jobs = list_jobs(raw, out, settings)
     staging = out / STATE / "staging"
     with alone("prepare", out, STATE):
+        check_card("prepare", out, STATE)
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir()
         jobs = replace_clips(jobs, out / STATE / "clips", num_proc)
@@ -79,6 +82,7 @@ def prepare_gift_i(
         else:
             for name in ("README.md", "groups.jsonl"):
                 (out / name).unlink(missing_ok=True)
+        note_card(out, STATE)
         write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False))
         write_html(out, report)
     return report
@@ -109,13 +113,14 @@ def _make_groups(
         for job, outcome in side_by_side("prepare", prepare_group, jobs, num_proc):
             if outcome.digest is None or outcome.digest != job.known:
                 key = job.split, job.group_id
+                _check_place(out, job, outcome)
                 if kept.pop(key, None):  # first the table, then the files: the table never names what is not there
                     write_rows(_rows(kept, jobs), out)
-                _install(out, job, outcome)
+                files = _install(out, job, outcome)
                 if outcome.row is not None:
                     kept[key] = outcome.row
                     write_rows(_rows(kept, jobs), out)
-                records[key] = _write_record(out, job, outcome)
+                records[key] = _write_record(out, job, outcome, files)
             bar.group_done(job.notes)
     entries = [records[job.split, job.group_id]["entry"] for job in jobs]
     return _report(raw, out, settings, entries, removed), _rows(kept, jobs)
@@ -176,30 +181,71 @@ def _read_record(out: Path, job: Job) -> dict | None:
     return record if whole else None
 
 
-def _write_record(out: Path, job: Job, outcome: Outcome) -> dict:
-    """The last step of a group: only a group with a record counts as finished."""
-    files = {
-        path.relative_to(out).as_posix(): path.stat().st_size
-        for place in _places(out, job.split, job.group_id)
-        for path in sorted(place.rglob("*"))
-        if path.is_file()
-    }
+def _own_files(out: Path, split: str, group_id: str) -> set[str]:
+    """What earlier runs wrote of a group and nobody has changed since, by names in OUT; a killed run's record says
+    what it was about to write."""
+    try:
+        record = json.loads(_record_path(out, split, group_id).read_text(encoding="utf-8"))
+        stated = [record["files"], record.get("replaced", {})]
+        sizes = {name: {files.get(name) for files in stated} for name in {*stated[0], *stated[1]}}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return set()
+    found = _sizes(out, _places(out, split, group_id))
+    return {name for name, size in found.items() if size in sizes.get(name, ())}
+
+
+def _sizes(root: Path, places: Collection[Path]) -> dict[str, int]:
+    """{name in `root`: size} of the files below `places`."""
+    paths = [place / name for place in places for name in strangers(place)]
+    return {path.relative_to(root).as_posix(): path.lstat().st_size for path in paths}
+
+
+def _check_place(out: Path, job: Job, outcome: Outcome) -> None:
+    """Raise ValueError if a staged group would replace a file that no run wrote, or that was changed since."""
+    own = _own_files(out, job.split, job.group_id)
+    for name in _staged(job, outcome):
+        if os.path.lexists(out / name) and name not in own:
+            raise ValueError(
+                f"{out / name}: not written by gift-peft prepare, or changed since, and it would be replaced; "
+                "move it away (or delete it, if it is damaged) and run again"
+            )
+
+
+def _staged(job: Job, outcome: Outcome) -> dict[str, int]:
+    """{name in OUT: size} of what a group brings."""
+    made, proposed = _places(job.staging, job.split, job.group_id)
+    return _sizes(job.staging, [proposed] if outcome.row is None else [made, proposed])
+
+
+def _write_record(out: Path, job: Job, outcome: Outcome, files: dict[str, int]) -> dict:
+    """The last step of a group: only a group with a record that states its digest counts as finished.
+
+    One that was rejected for its long name has no record.
+    """
     record = {"format": FORMAT, **vars(outcome), "files": files}
-    write_whole(_record_path(out, job.split, job.group_id), json.dumps(record, allow_nan=False))
+    if len(os.fsencode(job.group_id)) <= MAX_GROUP_ID:
+        write_whole(_record_path(out, job.split, job.group_id), json.dumps(record, allow_nan=False))
     return record
 
 
-def _install(out: Path, job: Job, outcome: Outcome) -> None:
-    """Put a staged group and its proposed masks in the place of what was there."""
-    _record_path(out, job.split, job.group_id).unlink(missing_ok=True)
-    made, proposed = _places(job.staging, job.split, job.group_id)
-    if outcome.row is None:
-        shutil.rmtree(made, ignore_errors=True)
-    for staged, target in zip((made, proposed), _places(out, job.split, job.group_id), strict=True):
-        shutil.rmtree(target, ignore_errors=True)
-        if staged.is_dir():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(staged, target)
+def _install(out: Path, job: Job, outcome: Outcome) -> dict[str, int]:
+    """Put a staged group and its proposed masks in the place of what was there; {name in OUT: size} of its files.
+
+    Files that no run wrote stay beside them. First a record without a digest says which are going and coming, so that
+    after a kill they are still known as ours.
+    """
+    before, staged = _own_files(out, job.split, job.group_id), _staged(job, outcome)
+    places = _places(out, job.split, job.group_id)
+    replaced = {name: size for name, size in _sizes(out, places).items() if name in before}
+    if not (before or staged):
+        return {}
+    claim = {"format": FORMAT, "digest": None, "files": staged, "replaced": replaced}
+    write_whole(_record_path(out, job.split, job.group_id), json.dumps(claim))
+    remove_files(out, before)
+    for name in staged:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(job.staging / name, out / name)
+    return staged
 
 
 def _remove_others(out: Path, wanted: Collection[tuple[str, str]]) -> list[str]:
@@ -211,8 +257,7 @@ def _remove_others(out: Path, wanted: Collection[tuple[str, str]]) -> list[str]:
         for split in SPLITS:
             (out / split / "metadata.parquet").unlink(missing_ok=True)
     for key in gone:
-        for place in _places(out, *key):
-            shutil.rmtree(place, ignore_errors=True)
+        remove_files(out, _own_files(out, *key))
         _record_path(out, *key).unlink()
     return ["/".join(key) for key in gone]
 

@@ -4,6 +4,7 @@ Files are listed and their masks found, as a run does it; one group is prepared 
 frame is what the estimate stands on. RAW and OUT stay as they are.
 """
 
+import os
 import shutil
 import sys
 import tempfile
@@ -39,7 +40,7 @@ def tell_plan(raw: Path, out: Path, settings: PrepareSettings, num_proc: int) ->
             capture = _read(job)
         except (OSError, ValueError, RecursionError) as error:
             text = " ".join(str(error).split()) or type(error).__name__
-            rejected[f"{job.split}/{printable(job.group_id)}"] = printable(text)
+            rejected[f"{job.split}/{printable(job.group_id)}"] = printable(text.replace(f"{raw}{os.sep}", ""))
             continue
         if job.known is not None and job.known == capture_digest(capture, group_choices(settings, capture)):
             done += 1

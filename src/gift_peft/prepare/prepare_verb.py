@@ -30,8 +30,9 @@ def run(argv: Sequence[str]) -> int:
 
     Raises ValueError or an OSError (one line) where nothing could be made; a wrong command line leaves by SystemExit.
     """
-    args = parse_arguments(argv)
-    if args.__dict__.pop("dry_run"):
+    words = [word for word in argv if word.replace("_", "-") != "--dry-run"]
+    args = parse_arguments(words)
+    if len(words) < len(argv):
         from gift_peft.prepare.prepare_plan import tell_plan
 
         return tell_plan(Path(args.raw), Path(args.out), args.settings, args.num_proc)
@@ -42,14 +43,14 @@ def run(argv: Sequence[str]) -> int:
         if entry["status"] == "rejected":
             text = entry["reasons"][0]["text"]
             print(f"gift-peft: rejected: {entry['split']}/{entry['group_id']}: {text}", file=sys.stderr)
-    accepted = [entry for entry in report["groups"] if entry["status"] == "kept" and entry["proposal"]]
-    if accepted:
-        names = ", ".join(f"{e['split']}/{e['group_id']} (score {e['proposal']['score']:.2f})" for e in accepted)
-        print(f"Masks that were proposed, not drawn, and accepted: {names}")
     for entry in report["groups"]:
         for note in entry["warnings"]:
             if note["code"] in NOTES:
                 print(f"gift-peft: {entry['split']}/{entry['group_id']}: {note['text']}", file=sys.stderr)
+    accepted = [entry for entry in report["groups"] if entry["status"] == "kept" and entry["proposal"]]
+    if accepted:
+        names = ", ".join(f"{e['split']}/{e['group_id']} (score {e['proposal']['score']:.2f})" for e in accepted)
+        print(f"Masks that were proposed, not drawn, and accepted: {names}")
     for split, found in report["statistics"].items():
         print(
             f"{split}: {found['groups']} groups, {found['images']} images ({found['warped_frames']} frames warped, "
@@ -103,7 +104,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     values = vars(parser.parse_args(argv))
     if values["config"] is not None:
         values = vars(parser.parse_args([*_read_config(Path(values["config"])), *argv]))
-    del values["config"]
+    del values["config"], values["dry_run"]  # `run` has looked for the second
     parts = {name: kind(**{key: values.pop(key) for key in _options(kind)}) for name, kind in PARTS.items()}
     choices = {key: values.pop(key) for key in _options(PrepareSettings)}
     choices["propose_masks"] |= choices["accept_proposed_masks"] or choices["refine"] is not None

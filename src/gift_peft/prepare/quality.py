@@ -14,22 +14,57 @@ from gift_peft.prepare.settings import QualitySettings
 SHRINK = 4  # comparisons between frames are made at a quarter of the size: noise and half-pixel shifts average out
 # code, figure, whether a small value is bad, threshold of the warning, threshold of dropping, text
 CHECKS = (
-    ("blurred", "sharpness", True, "warn_sharpness", "drop_sharpness", "sharpness relative to the group"),
-    ("too_dark", "clipped_dark", False, "warn_clipped", "drop_clipped", "fraction of black pixels"),
-    ("too_bright", "clipped_bright", False, "warn_clipped", "drop_clipped", "fraction of white pixels"),
-    ("another_scene", "outside_correlation", True, None, "min_outside_correlation", "correlation outside the target"),
+    (
+        "blurred",
+        "sharpness",
+        True,
+        "warn_sharpness",
+        "drop_sharpness",
+        "blurred: sharpness, where 1 is the middle of the group",
+    ),
+    ("too_dark", "clipped_dark", False, "warn_clipped", "drop_clipped", "too dark: share of nearly black pixels"),
+    (
+        "too_bright",
+        "clipped_bright",
+        False,
+        "warn_clipped",
+        "drop_clipped",
+        "too bright: share of nearly white pixels",
+    ),
+    (
+        "another_scene",
+        "outside_correlation",
+        True,
+        None,
+        "min_outside_correlation",
+        "another scene: likeness outside the target (correlation)",
+    ),
     (
         "outside_change",
         "outside_change",
         False,
         "warn_outside_change",
         "drop_outside_change",
-        "fraction that changed outside the target",
+        "something else changed: share of the pixels outside the target",
     ),
-    ("mask_small", "mask_area", True, "warn_mask_area_low", None, "fraction of the image that is target"),
-    ("mask_large", "mask_area", False, "warn_mask_area_high", None, "fraction of the image that is target"),
-    ("mask_border", "mask_border", False, "warn_mask_border", None, "fraction of the border that is target"),
-    ("mask_disagrees", "mask_iou", True, "warn_mask_iou", "drop_mask_iou", "overlap with the group's masks"),
+    ("mask_small", "mask_area", True, "warn_mask_area_low", None, "small mask: share of the image"),
+    ("mask_large", "mask_area", False, "warn_mask_area_high", None, "large mask: share of the image"),
+    (
+        "mask_border",
+        "mask_border",
+        False,
+        "warn_mask_border",
+        None,
+        "the mask touches the border: share of the image's border",
+    ),
+    (
+        "mask_disagrees",
+        "mask_iou",
+        True,
+        "warn_mask_iou",
+        "drop_mask_iou",
+        "another mask than the others: overlap with them",
+    ),
 )
 
 
@@ -183,6 +218,12 @@ def _judge(figures: FrameQuality, settings: QualitySettings) -> tuple[list[Remar
         for name, found in ((drop, reasons), (warn, warnings)):
             threshold = None if name is None else getattr(settings, name)
             if None not in (value, threshold) and (value < threshold if low else value > threshold):
-                found.append(Remark(code, f"{text}: {value:.4g}, threshold {threshold:g}"))
+                found.append(Remark(code, f"{text}: {plain_number(value)}, threshold {plain_number(threshold)}"))
                 break
     return reasons, warnings
+
+
+def plain_number(value: float) -> str:
+    """Three digits and no exponent."""
+    text = f"{value:.3g}"
+    return text if "e" not in text else f"{value:.0f}" if abs(value) >= 1 else f"{value:.6f}".rstrip("0").rstrip(".")

@@ -62,7 +62,10 @@ def register(moving: Frame, fixed: Frame, declared_static: bool = False, treated
     if result.status == "dropped" and result.reasons[0].code != "moved_too_far":
         by_pixels = _identity_by_pixels(moving, fixed)
         if by_pixels is not None:
-            warning = Remark("by_pixels", "too few matches agree; the pixels outside the target show no motion")
+            warning = Remark(
+                "by_pixels",
+                "too few matched points agree, but the pixels outside the target show no motion: it is not moved",
+            )
             figures = replace(result.figures, method="pixels", **by_pixels)
             result = Registration("identity", np.eye(3), figures, warnings=[warning])
     return _by_the_paper(moving, fixed, result, treated) if settings.paper_exact else result
@@ -91,27 +94,36 @@ def _decide(match: Matches, moving: Frame, fixed: Frame, treated: bool) -> Regis
     if match.median_displacement < settings.identity_displacement and not hidden:
         return Registration("identity", np.eye(3), figures)
     if fit is not match.fit and moved < settings.identity_displacement and _still_by(fit, match, settings):
-        text = "the matches move by half a pixel or more, the pixels outside the target do not"
+        text = "matched points move by half a pixel or more, but the pixels outside the target do not: it is not moved"
         figures.method = "pixels"
         return Registration("identity", np.eye(3), figures, warnings=[Remark("by_pixels", text)])
     bound, farthest = settings.max_displacement * float(np.hypot(*fixed.size)), max(corner, moved)
     reasons = []
     if farthest > bound:
-        reasons.append(Remark("moved_too_far", f"a corner moves by {farthest:.1f} px, bound {bound:.1f}"))
+        reasons.append(
+            Remark(
+                "moved_too_far", f"the camera moved too far: by {farthest:.1f} px at a corner, {bound:.1f} px allowed"
+            )
+        )
     if bent > settings.max_distortion:
-        text = f"lengths change by {100 * bent:.1f} %, bound {100 * settings.max_distortion:.1f} %"
+        text = f"the camera turned or came closer: lengths change by {100 * bent:.1f} %"
+        text += f", {100 * settings.max_distortion:.1f} % allowed"
         reasons.append(Remark("distorted", text))
     if match.inlier_ratio < settings.min_inlier_ratio:
-        text = f"{match.count} of {match.near.sum()} matches agree ({100 * match.inlier_ratio:.0f} %)"
+        text = f"no one motion of the camera explains it: {match.count} of {match.near.sum()} matched points agree"
+        text += f" ({100 * match.inlier_ratio:.0f} %)"
         reasons.append(Remark("low_inlier_ratio", f"{text}, {100 * settings.min_inlier_ratio:.0f} % needed"))
     if error > settings.max_target_error:
-        text = f"the map may be {error:.2f} px off at the target's corners, bound {settings.max_target_error}"
+        text = f"the camera's motion is uncertain by {error:.2f} px at the target's corners"
+        text += f", {settings.max_target_error} px allowed"
         reasons.append(Remark("uncertain", text))
     if fit.correlation < settings.min_correlation:
-        text = f"the pictures outside the target correlate by {fit.correlation:.2f}, {settings.min_correlation} needed"
+        text = f"outside the target it does not look like the others (correlation {fit.correlation:.2f}"
+        text += f", {settings.min_correlation} needed)"
         reasons.append(Remark("no_match", text))
     if not after <= before:
-        text = f"warping would raise the difference outside the target from {before:.2f} to {after:.2f}"
+        text = f"moving it into place would not help: outside the target it would differ by {after:.2f} grey levels"
+        text += f", not {before:.2f}"
         reasons.append(Remark("worse_outside", text))
     if treated and fit is not match.fit and [item.code for item in reasons] == ["low_inlier_ratio"]:
         figures.method = "pixels"
@@ -154,7 +166,7 @@ def _by_the_paper(moving: Frame, fixed: Frame, ours: Registration, treated: bool
     if accepted:
         return Registration("warped", matrix, figures)
     share = "" if ratio is None else f" ({100 * ratio:.0f} %)"
-    text = f"{match.count} of {near} matches agree{share}"
+    text = f"no one motion of the camera explains it: {match.count} of {near} matched points agree{share}"
     return Registration("dropped", None, figures, [Remark("low_inlier_ratio", text)])
 
 
@@ -169,10 +181,13 @@ def _contrasts(settings: RegistrationSettings) -> list[float]:
 def _weak(match: Matches, settings: RegistrationSettings) -> Remark | None:
     """Why the matches do not determine a map at all, None if they do."""
     if match.count < settings.min_inliers:
-        return Remark("no_match", f"{match.count} matches agree, {settings.min_inliers} needed")
+        return Remark(
+            "no_match", f"{match.count} matched points agree on the camera's motion, {settings.min_inliers} needed"
+        )
     spread = match.spread
     if match.fit is None or spread < settings.min_spread:
-        text = f"the agreeing matches spread over {spread:.3f} of the frame, {settings.min_spread} needed"
+        text = f"the points that agree on the camera's motion lie too close together: {spread:.3f} of the photo's"
+        text += f" diagonal, {settings.min_spread} needed"
         return Remark("narrow", text)
     return None
 
@@ -202,7 +217,12 @@ def _diagnose(tries: list[Matches], fixed: Frame) -> list[Remark]:
         if matrix is not None and inliers.sum() >= max(8, 0.6 * len(inliers)):
             moved = displacement(matrix, fixed.corners)
             if moved > bound:
-                return [Remark("moved_too_far", f"the target moves by about {moved:.0f} px, bound {bound:.1f}")]
+                return [
+                    Remark(
+                        "moved_too_far",
+                        f"the camera moved too far: the target by about {moved:.0f} px, {bound:.1f} px allowed",
+                    )
+                ]
     return [_weak(tries[-1], settings)]
 
 

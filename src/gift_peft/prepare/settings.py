@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass, field
 
 from gift_peft.captures.foreign import Layout
+from gift_peft.captures.group_facts import EMPTY_MASKS
 from gift_peft.captures.known_datasets import KnownLayout
-from gift_peft.captures.tree import EMPTY_MASKS
 
 
 def _option(text: str, metavar: str = "X", least: int = 0) -> dict:
@@ -90,12 +90,12 @@ class PrepareSettings:
         "propose masks for groups that lack any, into OUT/masks_proposed; they are not used", False
     )
     accept_proposed_masks: bool = _arg("use the proposed masks, which the dataset card then says", False)
-    min_proposal_score: float = _arg("score (0 to 1) below which a proposed mask is never accepted", 0.5)
     empty_masks: str = field(
         default="refuse",
         metadata=_option("what photos without a target are in a group whose others have one: an error, or fine")
         | {"choices": EMPTY_MASKS},
     )
+    min_proposal_score: float = _arg("score (0 to 1) below which a proposed mask is never accepted", 0.5)
     refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
     max_frames: int = _arg("photos that are chosen of a clip, for each pose of the camera", 12, metavar="N", least=1)
     layout: Layout | KnownLayout | None = field(

@@ -22,11 +22,11 @@ from tqdm import tqdm
 
 from gift_peft.captures.masks import is_mask_file
 from gift_peft.captures.tree import Capture, check_masks, find_groups, read_capture
-from gift_peft.files import read_yaml, remove_folder, whole_folder, write_whole
+from gift_peft.files import read_yaml, remove_folder, strangers, whole_folder, write_whole
 from gift_peft.images import image_digest, is_image_file, read_image
 from gift_peft.prepare.job import capture_digest, printable
-from gift_peft.prepare.out_folder import alone, check_places, side_by_side
-from gift_peft.rules import SPLITS
+from gift_peft.prepare.out_folder import alone, check_card, check_places, note_card, side_by_side
+from gift_peft.rules import SPLITS, check_group_id
 from gift_peft.surface_targets import paint_fills
 
 VERB, STATE = "synthesize", ".synthesize"
@@ -119,6 +119,7 @@ def synthesize_groups(
     report = SynthesisReport()
     jobs = _list_jobs(photos, out / "train", fills, seed, report)
     with alone(VERB, out, STATE):
+        check_card(VERB, out, STATE)
         _tidy(out / "train", {job.folder.name for job in jobs}, report)
         outcomes = {}
         with tqdm(total=len(jobs), desc="photos", unit="photo", disable=None, delay=2) as bar:
@@ -134,6 +135,7 @@ def synthesize_groups(
             if outcome.made:
                 report.made.append(job.folder.name)
         _write_card(photos, out, len(report.groups), fills)
+        note_card(out, STATE)
     return report
 
 
@@ -204,6 +206,7 @@ def _make_group(job: _Job) -> _Outcome:
     """Write the group of one photo unless it is there already. What is wrong with the photo is in the outcome."""
     foreign = _foreign(job.folder)
     try:
+        check_group_id(job.folder.name)
         check_masks(job.capture)
         if job.name != printable(job.name):
             raise ValueError(f"{printable(job.name)}: the name is not valid Unicode text; rename the file")
@@ -215,13 +218,15 @@ def _make_group(job: _Job) -> _Outcome:
             return _Outcome(wrong=foreign)
         pictures, mask = _paint(job)
     except (OSError, ValueError, cv2.error, MemoryError, RecursionError) as error:
-        if foreign is None and job.folder.exists():  # what an earlier run made of this photo is no longer right
+        if foreign is None and os.path.lexists(
+            job.folder
+        ):  # what an earlier run made of this photo is no longer right
             remove_folder(job.folder)
         return _Outcome(wrong=" ".join(str(error).split()) or type(error).__name__)
     known = {key: value for key, value in job.capture.facts.items() if key in ("surface", "notes")}
     facts = {**known, "static_rig": True, MARK: {**mark, "digest": digest}}
     mask_file = _png(Image.fromarray(mask.astype(np.uint8) * 255))
-    with whole_folder(job.folder) as folder:
+    with whole_folder(job.folder, _files(_mark(job.folder))) as folder:
         for name, picture in zip(_names(job.fills), pictures, strict=True):
             write_whole(folder / name, _png(picture))
             write_whole(folder / "masks" / name, mask_file)
@@ -231,7 +236,9 @@ def _make_group(job: _Job) -> _Outcome:
 
 def _paint(job: _Job) -> tuple[list[Image.Image], np.ndarray]:
     """The photo and its painted copies, and the mask; ValueError or another error naming the file."""
-    path, source = job.capture.images[0], job.capture.masks[0] or job.capture.common
+    path, source = job.capture.images[0], job.capture.masks[0]
+    if source is None or not source.annotated:
+        source = job.capture.common or source
     image = read_image(path)
     mask = source.read(image.size)
     if not mask.any():
@@ -268,7 +275,10 @@ def _mark(folder: Path) -> dict | None:
     return mark if isinstance(mark, dict) and isinstance(mark.get("fills"), int) else None
 
 
-def _files(mark: dict) -> set[str]:
+def _files(mark: dict | None) -> set[str]:
+    """The files of a group that bears this mark; without one none is ours."""
+    if mark is None:
+        return set()
     names = _names(mark["fills"])
     return {"group.yaml", *names, *(f"masks/{name}" for name in names)}
 
@@ -287,9 +297,7 @@ def _foreign(folder: Path) -> str | None:
     mark = _mark(folder)
     if mark is None:
         return f"{folder}: not made by gift-peft synthesize, so it is left as it is; move it away"
-    found = {path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir() and path.name[0] != "."}
-    others = sorted({path.as_posix() for path in found} - _files(mark))
-    if others:
+    if others := strangers(folder, _files(mark)):
         return f"{folder / others[0]}: not made by gift-peft synthesize, so its group is left as it is; move it away"
     return None
 

@@ -13,8 +13,17 @@ from typing import Any
 from gift_peft.files import write_whole
 
 # Figure 5; of Figure 6 whichever a run has.
-DYNAMICS = {"train_gce": "train GCE", "val_gce": "validation GCE", "booster_tom_rmse": "Booster ToM RMSE"}
-RETENTION = {"val_other_rmse": "GIFT-I Other RMSE", "booster_other_rmse": "Booster Other RMSE"}
+DYNAMICS = {
+    "train_gce": "disagreement in the target (GCE), training groups",
+    "val_gce": "disagreement in the target (GCE), validation groups",
+    "booster_tom_rmse": "error in the target (ToM RMSE), Booster",
+}
+RETENTION = {
+    "val_other_rmse": "Other RMSE, validation groups",
+    "booster_other_rmse": "Other RMSE, Booster",
+}
+YLABEL = "times the base's value"
+HINT = "1 is the base before training; lower is better. Thick: smoothed, thin: as measured."
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DASHES = ("-", "--", "-.", ":")
 DIVERGED = 2.0  # times the base: next to such a run the others look flat, so they get a second plot
@@ -61,7 +70,7 @@ def draw_dynamics(
         `list[str]`: names of the curves drawn; nothing is written if there are none.
     """
     plots = [(name, _curves(history, DYNAMICS)) for name, history in runs]
-    return _draw([plot for plot in plots if plot[1]], "relative to the base", paths, width)
+    return _draw([plot for plot in plots if plot[1]], "What training changes inside the target", paths, width)
 
 
 def draw_retention(
@@ -80,7 +89,7 @@ def draw_retention(
             plots.append((title, curves))
         if 0 < len(calm) < len(curves):
             plots.append((f"{title}, without diverged runs", calm))
-    return _draw(plots, "relative to the base", paths, width)
+    return _draw(plots, "What training costs outside the target", paths, width)
 
 
 def _curves(history: list[dict], keys: dict[str, str]) -> list[Curve]:
@@ -88,16 +97,17 @@ def _curves(history: list[dict], keys: dict[str, str]) -> list[Curve]:
     return [curve for curve in curves if curve[1]]
 
 
-def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Path], width: int | None) -> list[str]:
+def _draw(plots: list[tuple[str, list[Curve]]], title: str, paths: Sequence[Path], width: int | None) -> list[str]:
     if not plots:
         return []
     names = list(dict.fromkeys(name for _, curves in plots for name, _, _ in curves))
     pyplot = _import_pyplot()
     figure, axes = pyplot.subplots(
-        1, len(plots), figsize=(max(4.8, 3.6 * len(plots)), 3.2), squeeze=False, layout="constrained"
+        1, len(plots), figsize=(max(5.6, 4.6 * len(plots)), 4.2), squeeze=False, layout="constrained"
     )
     try:
-        for axis, (title, curves) in zip(axes[0], plots, strict=True):
+        figure.suptitle(f"{title}\n{HINT}", fontsize=9)
+        for axis, (subtitle, curves) in zip(axes[0], plots, strict=True):
             for name, epochs, values in curves:
                 number = names.index(name)
                 style = {"color": COLORS[number % len(COLORS)], "linestyle": DASHES[number % len(DASHES)]}
@@ -107,13 +117,14 @@ def _draw(plots: list[tuple[str, list[Curve]]], ylabel: str, paths: Sequence[Pat
                 axis.plot(
                     epochs, smooth(values, width or max(3, len(values) // 10 | 1)), label=name, linewidth=1.8, **style
                 )
-            axis.axhline(1, color="0.5", linewidth=0.8)
+            axis.axhline(1, color="0.5", linewidth=0.8, label="the base")
             if max(max(values) for _, _, values in curves) > 10:
                 axis.set_yscale("log")
             axis.xaxis.get_major_locator().set_params(integer=True)
-            axis.set(title=title, xlabel="epoch", ylabel=ylabel)
+            axis.set(title=subtitle, xlabel="epoch", ylabel=YLABEL)
             axis.title.set_fontsize(10)
-            axis.legend(fontsize=8, frameon=False)
+            # Below the plot, where it hides no curve.
+            axis.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.16))
             axis.spines[["top", "right"]].set_visible(False)
         for path in paths:
             stream = io.BytesIO()

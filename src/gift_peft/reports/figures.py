@@ -127,14 +127,18 @@ def before_after(
     return save_grid([panel_row(panel) for panel in rows], columns, path)
 
 
-def panel_row(panel: Panel) -> GridRow:
-    """RGB, reference, base and adapted of one panel as coloured tiles."""
-    aligned = align_panel(panel)
-    maps = (aligned.reference, aligned.base, aligned.adapted)
+def panel_row(panel: Panel, *others: Panel) -> GridRow:
+    """RGB, reference, base and adapted of one panel as coloured tiles.
+
+    `others`: the same picture, reference and base with other adapted predictions, each one tile more.
+    """
+    aligned, more = align_panel(panel), [align_panel(other) for other in others]
+    maps = (aligned.reference, aligned.base, aligned.adapted, *(other.adapted for other in more))
     low, high = color_range(*maps)
     tiles = [colorize(depth, low, high, aligned.kind) for depth in maps]
+    errors = (*aligned.errors, *(other.errors[1] for other in more))
     bar = _bar(low, high, aligned.kind, aligned.unit)
-    return GridRow(_caption(panel, aligned), [_picture(panel), *tiles], bar, panel.target)
+    return GridRow(_caption(panel.label, errors, aligned.unit), [_picture(panel), *tiles], bar, panel.target)
 
 
 def error_maps(
@@ -155,8 +159,8 @@ def error_row(panel: Panel) -> GridRow:
     high = color_range(*errors)[1]
     tiles = [_picture(panel), *(colorize_error(error, high) for error in errors)]
     colors = colorize_error(np.linspace(0, high, 256)[None], high)
-    bar = ColorBar(colors, "no error", f"{_in_units(high, aligned.unit)} or more")
-    return GridRow(_caption(panel, aligned), tiles, bar, panel.target)
+    bar = ColorBar(colors, "no error", f"{_in_units(high, aligned.unit)} or more{_unit(aligned.unit)}")
+    return GridRow(_caption(panel.label, aligned.errors, aligned.unit), tiles, bar, panel.target)
 
 
 def prediction_row(label: str, image: Image.Image, predictions: Sequence[np.ndarray], kind: str) -> GridRow:
@@ -170,20 +174,20 @@ def _picture(panel: Panel) -> np.ndarray:
     return np.asarray(panel.image.convert("RGB"))
 
 
-def _caption(panel: Panel, aligned: Aligned) -> str:
-    """What the row shows, and the error before and after."""
+def _caption(label: str, errors: Sequence[float], unit: str) -> str:
+    """What the row shows, and the error of the base and of each adapted prediction."""
     scores = "unknown"
-    if not np.isnan(aligned.errors).any():
-        before, after = (_in_units(error, aligned.unit) for error in aligned.errors)
-        scores = f"{before} before, {after} after"
-    return f"{panel.label}   RMSE in the outline: {scores}"
+    if not np.isnan(errors).any():
+        before, *after = (_in_units(error, unit) for error in errors)
+        scores = f"{before} before, {' and '.join(after)} after{_unit(unit)}"
+    return f"{label} · RMSE in the outline: {scores}"
 
 
 def _bar(low: float, high: float, kind: str, unit: str) -> ColorBar:
     """From near to far, whatever is larger in this kind of prediction."""
     near, far = (high, low) if kind == "inverse_depth" else (low, high)
     colors = colorize(np.linspace(near, far, 256)[None], low, high, kind)
-    return ColorBar(colors, f"near: {_in_units(near, unit)}", f"far: {_in_units(far, unit)}")
+    return ColorBar(colors, f"near: {_in_units(near, unit)}", f"far: {_in_units(far, unit)}{_unit(unit)}")
 
 
 def _in_units(value: float, unit: str) -> str:
@@ -191,7 +195,12 @@ def _in_units(value: float, unit: str) -> str:
     if unit == MILLIMETERS:
         return f"{value:,.0f} mm"
     digits = 0 if value == 0 else math.floor(math.log10(abs(value)))
-    return f"{value:,.{min(max(2 - digits, 0), 6)}f} {unit}"
+    return f"{value:,.{min(max(2 - digits, 0), 6)}f}"
+
+
+def _unit(unit: str) -> str:
+    """What follows the last of several numbers: millimeters stand behind each, the model's units once."""
+    return "" if unit == MILLIMETERS else f" {unit}"
 
 
 # ---- drawing ----

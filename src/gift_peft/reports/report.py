@@ -18,7 +18,7 @@ from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.statistics import value_of
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
 from gift_peft.evaluation.tables import comparison_table, group_table, protocol_note, uncertainty_table
-from gift_peft.files import reason, write_whole
+from gift_peft.files import check_inputs_stay, reason, write_whole
 from gift_peft.images import list_images
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.ablation import ablation_table, is_ablation
@@ -30,6 +30,8 @@ from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_na
 from gift_peft.reports.zero_shot import checkpoint_folders, draw_zero_shot
 from gift_peft.rules import GroupPictures
 
+HEAD = "# GIFT: "  # a report.md of ours begins so
+WRITTEN = ("report.md", "tables/*", "*.png", "*.pdf", "compare*.html", "model_card.md")
 COMPARED_GROUPS = 40  # in compare.html, one observation each: a browser has to open it
 HEADINGS = {
     "gift-i-proxy": "GIFT-I, against the treated reference",
@@ -96,7 +98,8 @@ def run_report(
 
     Raises:
         FileNotFoundError: a folder that is neither run nor evaluation; a picture or checkpoint that is not there.
-        ValueError: a damaged file; a card of several runs.
+        ValueError: a damaged file; a card of several runs; an output that would replace a picture or what no report
+            wrote.
     """
     if not runs or panels < 0:
         raise ValueError(f"panels: must not be negative, got {panels}" if runs else "report needs a run")
@@ -109,15 +112,20 @@ def run_report(
     if planned and not card:
         raise ValueError(f"{planned[0].path}: not a run yet; --model-card FILE writes the card of what it will be")
     if planned:
-        return _write_card(saved[0], Path("model_card.md") if card is True else Path(card))
+        path = Path("model_card.md") if card is True else Path(card)
+        check_inputs_stay([path], [saved[0].path])
+        return _write_card(saved[0], path)
     if zero_shot:  # fail early on a missing picture or checkpoint
         list_images(zero_shot)
         for run in saved:
             checkpoint_folders(run, steps)
     folder = Path(out) if out else saved[0].path / "report" if len(saved) == 1 else Path("report")
-    folder.mkdir(parents=True, exist_ok=True)
-    output = Output(folder, color)
     names = run_names(saved)
+    _claim(folder, names)
+    if zero_shot:
+        drawn = [folder / f"zero-shot-{own}{suffix}" for own in folder_names(saved) for suffix in (".png", ".pdf")]
+        check_inputs_stay(drawn, list_images(zero_shot))
+    output = Output(folder, color)
     for run in saved:
         _evaluate_if_missing(run, output, device)
     _tables(saved, names, output)
@@ -135,6 +143,16 @@ def run_report(
     for remark in output.remarks:
         print(f"  not in it: {remark}")
     return folder
+
+
+def _claim(folder: Path, names: Sequence[str]) -> None:
+    """Make the report's folder; ValueError if it holds files in the way of the report that no report wrote."""
+    page = folder / "report.md"
+    if page.is_file() and page.read_bytes().startswith(HEAD.encode()):
+        return
+    if there := sorted({path.relative_to(folder).parts[0] for name in WRITTEN for path in folder.glob(name)}):
+        raise ValueError(f"{folder} has {', '.join(there[:3])}, which no report wrote: it is kept; name another --out")
+    write_whole(page, f"{HEAD}{', '.join(dict.fromkeys(names))}\n\nNot finished: run `gift-peft report` again.\n")
 
 
 def _write_card(run: SavedRun, path: Path) -> Path:
@@ -369,6 +387,6 @@ def _zero_shot(
 
 
 def _write_markdown(names: Sequence[str], output: Output) -> None:
-    head = f"# GIFT: {', '.join(dict.fromkeys(names))}\n"
+    head = f"{HEAD}{', '.join(dict.fromkeys(names))}\n"
     missing = [f"Not in this report: {remark}\n" for remark in output.remarks]
     write_whole(output.folder / "report.md", "\n".join([head, *output.sections, *missing]))

@@ -1,12 +1,15 @@
 """What `gift-peft report` finds in a folder: a run, an evaluation, or (a YAML file) a planned run."""
 
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from gift_peft.evaluation.results import Report
-from gift_peft.files import portable_name, read_yaml
+from gift_peft.files import locate, portable_name, read_yaml
+
+PLACES = {"model_name_or_path", "dataset_name", "base", "adapter", "dataset", "root"}  # in config.yaml, metrics.json
 
 
 @dataclass
@@ -77,7 +80,18 @@ def read_run(path: str | Path) -> SavedRun:
         run.record = _json(record, record.read_text(encoding="utf-8"))
     for folder in sorted(child for child in path.iterdir() if (child / "metrics.json").is_file()):
         run.evaluations[folder.name] = Report.load(folder)
+    for names in (run.arguments, *(report.about for report in run.evaluations.values())):
+        _find_again(names, path)
     return run
+
+
+def _find_again(names: dict, run: Path) -> None:
+    """Point to where base, adapter and data are now, if the run was moved with them, and say so."""
+    for key in PLACES & names.keys():
+        found = locate(names[key], run) if isinstance(names[key], str) else None
+        if found is not None and not Path(names[key]).exists():
+            warnings.warn(f"{key} {names[key]}: taken from {found}", stacklevel=3)
+            names[key] = str(found)
 
 
 def run_names(runs: Sequence[SavedRun]) -> list[str]:

@@ -18,7 +18,7 @@ import yaml
 from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.files import read_yaml
 from gift_peft.models.pixels import parse_size
-from gift_peft.options import OptionParser, did_you_mean
+from gift_peft.options import OptionParser, did_you_mean, expand_home
 
 # What a run may be resumed with when it differs: everything else changes the weights that come out.
 FREE_TO_CHANGE = {
@@ -76,7 +76,7 @@ SECTIONS = {
     "report_to": "record and sharing",
 }
 SELECTORS = ("gce", "normalized_gce", "tom_rmse")
-LAMBDA_C = {"consensus": 1.0, "surface": 2.0}
+LAMBDA_C = {"consensus": 1.0, "surface": 1.5}
 
 RANGES = (
     (
@@ -152,7 +152,7 @@ class GiftTrainingArguments:
     )
     lambda_c: float | None = _arg(
         "weight of the group consistency, Eq. 6, or of the distance to the surface target; default 1 for consensus, "
-        "2 for surface",
+        "1.5 for surface",
         None,
     )
     lambda_d: float = _arg("weight of the self-distillation, Eq. 6; 0 collapses the depth", 1.0)
@@ -163,8 +163,12 @@ class GiftTrainingArguments:
     flip: bool = _arg("surface: show every second image as in a mirror, with its own target", False)
     fills: int = _arg("surface: copies of each photo with its target painted, which the targets are made from", 6)
     surface_model: Literal["auto", "plane", "quantile"] = _arg("surface: what a surface is taken for", "auto")
-    surface_quantile: float = _arg("surface: of inverse depth over the observations; higher is nearer", 0.8)
-    surface_tau: float = _arg("surface: share of the predictions below the plane", 0.7)
+    surface_quantile: float | None = _arg(
+        "surface: of inverse depth over the observations; higher is nearer; default 0.65, without fills 0.8", None
+    )
+    surface_tau: float | None = _arg(
+        "surface: share of the predictions below the plane; default 0.5, without fills 0.7", None
+    )
     gradient_checkpointing: bool = _arg(
         "recompute the blocks in the backward; smaller graphs, more are retained", False
     )
@@ -216,8 +220,8 @@ class GiftTrainingArguments:
 
     def __post_init__(self):
         for name in _names():
-            if isinstance(value := getattr(self, name), Path):
-                setattr(self, name, str(value))
+            if isinstance(value := getattr(self, name), str | Path):
+                setattr(self, name, expand_home(str(value)))
         if self.mixed_precision == "fp16":
             raise ValueError("mixed_precision: fp16 would need a loss scaler around the group step; use bf16 or no")
         if str(self.retain) != "auto":
@@ -269,7 +273,9 @@ class GiftTrainingArguments:
                 raise ValueError(f"{name}: target: {self.target} does not take it")
         if self.lambda_c is None:
             self.lambda_c = LAMBDA_C[self.target]
-        self.surface_settings()
+        settings = self.surface_settings()
+        if self.target == "surface":
+            self.surface_quantile, self.surface_tau = settings.surface_quantile, settings.surface_tau
 
     def _foreign(self) -> tuple[str, ...]:
         (other,) = OWN.keys() - {self.target}
@@ -331,7 +337,7 @@ def parse_arguments(argv: Sequence[str]) -> GiftTrainingArguments:
     config.add_argument("--config", type=Path)
     parser = make_parser()
     config.error = parser.error = _raise
-    path = config.parse_known_args(argv)[0].config
+    path = expand_home(config.parse_known_args(argv)[0].config)
     from_file = [] if path is None else _yaml_to_argv(path)
     for option in (word.partition("=")[0] for word in argv if word.startswith("--")):
         if not parser.knows(option):

@@ -22,10 +22,10 @@ from datasets import Dataset
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from gift_peft.adapters.folder import ADAPTER_WEIGHTS
+from gift_peft.adapters.folder import ADAPTER_FILES, ADAPTER_WEIGHTS
 from gift_peft.dataset.gift_i import dataset_fingerprint
-from gift_peft.files import jsonable, reason, remove_folder, whole_folder, write_whole
-from gift_peft.models.identity import teacher_revision
+from gift_peft.files import jsonable, reason, remove_folder, strangers, whole_folder, write_whole
+from gift_peft.models.identity import FILES, earlier_revision, teacher_revision
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
 
 BEST = "best"
@@ -34,6 +34,7 @@ OPTIMIZER = "optimizer.safetensors"
 RNG = "rng_state.safetensors"
 STATE = "trainer_state.json"
 NEEDED = {ADAPTER_WEIGHTS, OPTIMIZER, RNG, STATE}
+CHECKPOINT_FILES = NEEDED | ADAPTER_FILES | {CHECKSUMS} | {f"{BEST}/{name}" for name in ADAPTER_FILES}
 # Temporary names of a run: of what it replaces as a whole, of that inside a checkpoint, and of single files.
 TEMPORARY = re.compile(
     r"\.+(adapter|adapter-last|checkpoint-\d+)(\.tmp)?\.(tmp|old)|\.(metrics\.jsonl|config\.yaml)\.\d+\.partial"
@@ -107,7 +108,7 @@ def write_checkpoint(
 ) -> None:
     """`output_dir/checkpoint-<step>`, whole or not at all; `save(folder)` writes the adapter. OSError if it fails."""
     target = output_dir / f"checkpoint-{state.step}"
-    with disk_errors(target), whole_folder(target) as folder:
+    with disk_errors(target), whole_folder(target, CHECKPOINT_FILES) as folder:
         save(folder)
         save_file(optimizer_tensors(model, optimizer), folder / OPTIMIZER)
         save_file(_rng_tensors(), folder / RNG)
@@ -139,6 +140,10 @@ def restore(
         before, state = saved.pop("identity"), State(**saved)
     except (KeyError, TypeError, AttributeError):
         raise ValueError(f"resume_from_checkpoint: {checkpoint} is of another version of gift-peft") from None
+    if str(pinned := before.get("model_name_or_path")).startswith(FILES):  # 0.1.0 pinned files, not tensors
+        base = model.get_base_model().name_or_path
+        if Path(base).is_dir() and pinned == earlier_revision(base):
+            before["model_name_or_path"] = identity["model_name_or_path"]
     _check_identity(before, identity)
     if state.step > total_steps:
         raise ValueError(f"resume_from_checkpoint: {checkpoint} is past the {total_steps} steps of this run")
@@ -154,7 +159,7 @@ def restore(
         write_metrics(output_dir, state.rows)
         best = output_dir / "adapter"
         if state.best_step:
-            with whole_folder(best) as folder:
+            with whole_folder(best, ADAPTER_FILES) as folder:
                 shutil.copytree(checkpoint / BEST, folder, dirs_exist_ok=True)
         else:
             shutil.rmtree(best, ignore_errors=True)
@@ -259,11 +264,12 @@ def prune_checkpoints(output_dir: Path, step: int, limit: int | None, keep: list
     """Delete all but the newest `limit` checkpoints up to `step`; those of the steps in `keep` neither count nor go.
 
     Nor do later ones, which a run has that was resumed before them: they may be damaged, and shall not push out the
-    one that was just written.
+    one that was just written. One in which somebody has put a file stays.
     """
     found = [f for f in list_checkpoints(output_dir) if _step(f) <= step and _step(f) not in keep]
     for folder in found[: -limit if limit else 0]:
-        remove_folder(folder)
+        if not strangers(folder, CHECKPOINT_FILES):
+            remove_folder(folder)
 
 
 @contextmanager

@@ -20,9 +20,11 @@ from peft import PeftModel
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import GiftRecipe, get_gift_model, get_recipe
 from gift_peft.dataset.cache import default_cache_dir
-from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
+from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.loader import PreparedGroups
+from gift_peft.dataset.proxies import proxies_command
 from gift_peft.dataset.tensors import Group
+from gift_peft.models.identity import weights_revision
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.models.pixels import resolve_size
 from gift_peft.reports.model_card import model_card
@@ -45,7 +47,7 @@ from gift_peft.training.start import (
     stop_signals,
     tell_lost_processes,
 )
-from gift_peft.training.teacher import make_proxies
+from gift_peft.training.teacher import make_proxies, told_of_surface
 
 
 @dataclass
@@ -140,6 +142,7 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command
         "mixed_precision": accelerator.mixed_precision,
         "num_processes": accelerator.num_processes,
         "base_revision": identity["model_name_or_path"],
+        "base_weights": weights_revision(args.model_name_or_path, args.model_revision),
         "dataset_fingerprint": identity["dataset_name"],
     }
     save = partial(_save_adapter, args, network, processor, about, schedule.epoch_steps)
@@ -192,8 +195,9 @@ def _groups(
         if surface is None:
             make(splits)
         else:  # with the surface targets of a split its proxies are made too
-            for split in splits:
-                make([split], **({"surface": surface, "kind": args.prediction_kind} if split == "train" else {}))
+            if "validation" in splits:
+                make(["validation"])
+            surface_folder = make(["train"], surface=surface, kind=args.prediction_kind)
     except PermissionError as error:
         options = ("x".join(map(str, size)), args.proxies_dir, args.model_revision, surface)
         command = proxies_command(args.model_name_or_path, args.dataset_name, *options)
@@ -207,6 +211,11 @@ def _groups(
             if split == "train" and surface is None:
                 for group_id, names in zip(rows["group_id"], rows["image_names"], strict=True):
                     check_pair(group_id, len(names))
+            if split == "train" and surface is not None:
+                told = told_of_surface(surface_folder, split, rows["group_id"])
+                accelerator.print(
+                    "\n".join(["Surface targets of the training groups", *(f"  {line}" for line in told)])
+                )
             groups[split] = PreparedGroups(rows, processor, size, args.dataloader_num_workers, cache_dir)
     return groups
 

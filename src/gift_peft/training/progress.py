@@ -81,6 +81,10 @@ def summary(adapter: Path, rows: list[dict], best_step: int | None, validated: b
             change = relative_change(before, after)
             shown = f" ({change:+.1f} %)" if math.isfinite(change) else ""
             lines.append(f"  {title:15}{number(before)} -> {number(after)}{shown}")
+    if len(lines) > 1 and rows[0]["val_gce"] is not None:
+        lines.append(
+            "  in the model's own units; RMSE on the validation groups, against its prediction of the treated surface"
+        )
     return "\n".join(lines)
 
 

@@ -30,11 +30,12 @@ def make_parser() -> OptionParser:
         "fills": "copies of each photo with its target painted in one color; 0 is allowed",
         "seed": "of their colors",
         "surface_model": "auto: a plane where it fits, else the quantile",
-        "surface_quantile": "of inverse depth, higher is nearer",
-        "surface_tau": "share of the predictions below the plane",
+        "surface_quantile": "of inverse depth, higher is nearer; default 0.65, without fills 0.8",
+        "surface_tau": "share of the predictions below the plane; default 0.5, without fills 0.7",
     }
     for field in fields(SurfaceSettings):
-        options = {"choices": MODELS} if field.name == "surface_model" else {"type": type(field.default)}
+        kind = float if field.default is None else type(field.default)
+        options = {"choices": MODELS} if field.name == "surface_model" else {"type": kind}
         name = f"--{field.name.replace('_', '-')}"
         surface.add_argument(name, default=field.default, help=text[field.name], **options)
     text = "a page to look at: each photo, its base prediction, surface target and treated reference"
@@ -49,7 +50,8 @@ def run(argv: Sequence[str]) -> int:
     settings = SurfaceSettings(**{field.name: getattr(args, field.name) for field in fields(SurfaceSettings)})
     if args.target is None and (settings != SurfaceSettings() or args.kind or args.page):
         parser.error("fills, seed, kind, page and the surface options are for --target surface")
-    from gift_peft.training.teacher import make_proxies
+    from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
+    from gift_peft.training.teacher import make_proxies, told_of_surface
 
     folder = make_proxies(
         args.base,
@@ -63,6 +65,10 @@ def run(argv: Sequence[str]) -> int:
         kind=args.kind,
     )
     print(f"{'Surface targets' if args.target else 'Proxies'}: {folder}")
+    if args.target:
+        for split in args.splits or gift_i_splits(args.dataset):
+            names = load_gift_i(args.dataset, split).select_columns(["group_id"])["group_id"]
+            print("\n".join(f"  {split}, {line}" for line in told_of_surface(folder, split, names)))
     if args.page:
         print(f"Page: {_write_page(args, settings, folder)}")
     return 0
@@ -72,11 +78,14 @@ def _write_page(args: Namespace, settings: SurfaceSettings, folder: Path) -> Pat
     """The page of all splits asked for, whole or not at all."""
     from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
     from gift_peft.dataset.rows import parsed
+    from gift_peft.models.pixels import parse_size
     from gift_peft.reports.targets_page import targets_page
 
     places = {"proxies_dir": args.proxies_dir, "revision": args.revision, "surface": settings}
+    places["size"] = parse_size(folder.name)
     splits = args.splits or gift_i_splits(args.dataset)
     groups = chain.from_iterable(parsed(load_gift_i(args.dataset, split, args.base, **places)) for split in splits)
-    kind = read_header(next(folder.glob(f"*/*{SURFACE_SUFFIX}.safetensors")))["kind"]
+    made = (place.glob(f"*/*{SURFACE_SUFFIX}.safetensors") for place in (folder, folder.parent))
+    kind = read_header(next(chain.from_iterable(made)))["kind"]
     write_whole(args.page, targets_page(groups, kind))
     return args.page

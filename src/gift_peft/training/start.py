@@ -6,7 +6,6 @@ Everything that can be known to fail fails here, before a model is loaded.
 import math
 import os
 import shlex
-import shutil
 import signal
 import sys
 import threading
@@ -24,14 +23,14 @@ from accelerate.state import AcceleratorState
 from accelerate.utils import DistributedDataParallelKwargs, ProjectConfiguration, parse_flag_from_env
 
 from gift_peft.evaluation.booster_scenes import find_booster
-from gift_peft.files import reason, write_whole
+from gift_peft.files import reason
 from gift_peft.training.arguments import GiftTrainingArguments
-from gift_peft.training.checkpoints import find_checkpoint, last_complete, list_checkpoints, remove_leftovers
+from gift_peft.training.checkpoints import find_checkpoint, last_complete, remove_leftovers
+from gift_peft.training.run_folder import check_folder, delete_run, holds_run, write_config
 from gift_peft.training.upload import check_push
 
 # How launchers tell a process how many there are: torchrun, Open MPI, MPICH and Intel MPI, MVAPICH, srun.
 WORLD_SIZES = ("WORLD_SIZE", "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
-RUN_FILES = ("config.yaml", "metrics.jsonl", "adapter", "adapter-last", "logs")
 
 
 def make_accelerator(args: GiftTrainingArguments) -> Accelerator:
@@ -110,8 +109,8 @@ def check_run(args: GiftTrainingArguments, accelerator: Accelerator, prepare: bo
 
     Without `prepare` not even those are removed, nor the output folder made.
 
-    Raises ValueError if the folder holds a run that the arguments neither resume nor overwrite, OSError if it cannot
-    be written, and either for a bad Booster root.
+    Raises ValueError if the folder holds a run that the arguments neither resume nor overwrite, or files in the run's
+    way that no run wrote, OSError if it cannot be written, and either for a bad Booster root.
     """
     output = Path(args.output_dir)
     check_push(args)
@@ -128,11 +127,12 @@ def check_run(args: GiftTrainingArguments, accelerator: Accelerator, prepare: bo
             raise ValueError(f"resume_from_checkpoint: the run in {output} has ended and its checkpoints are gone")
         if checkpoint is None:
             warn(f"no checkpoint in {output} yet: starting from the beginning")
-    elif not args.overwrite_output_dir and _holds_run(output):
+    elif not args.overwrite_output_dir and holds_run(output):
         raise ValueError(
             f"output_dir: {output} already holds a run; --resume_from_checkpoint latest goes on with it, "
             "--overwrite_output_dir deletes it"
         )
+    check_folder(output, args)
     if prepare:
         output.mkdir(parents=True, exist_ok=True)
     place = next(folder for folder in (output.absolute(), *output.absolute().parents) if folder.exists())
@@ -148,27 +148,18 @@ def claim_folder(args: GiftTrainingArguments, accelerator: Accelerator, fresh: b
     """Write config.yaml, in a `fresh` run after deleting an earlier one. For when all checks are done."""
     if accelerator.is_main_process:
         if fresh:
-            _delete_run(Path(args.output_dir))
-        write_whole(Path(args.output_dir) / "config.yaml", args.to_yaml())
+            delete_run(Path(args.output_dir))
+        write_config(Path(args.output_dir), args)
     accelerator.wait_for_everyone()
-
-
-def _holds_run(output: Path) -> bool:
-    return any((output / name).exists() for name in RUN_FILES) or bool(list_checkpoints(output))
-
-
-def _delete_run(output: Path) -> None:
-    """What a run writes, and nothing else that may lie in the folder."""
-    for path in [*(output / name for name in RUN_FILES), *list_checkpoints(output)]:
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
 
 
 @contextmanager
 def stop_signals() -> Iterator[SimpleNamespace]:
-    """Inside, SIGINT (Ctrl-C) and SIGTERM (clusters) are noted in `.signum` (else 0); a second SIGINT interrupts."""
+    """Inside, a signal to stop is noted in `.signum` (else 0); a second SIGINT interrupts.
+
+    SIGINT is Ctrl-C, SIGTERM and SIGUSR1 (`sbatch --signal`) come from clusters, SIGHUP from a terminal that closes;
+    nohup has that one ignored, and it stays so.
+    """
     stop = SimpleNamespace(signum=0)
 
     def note(signum, frame):
@@ -181,7 +172,11 @@ def stop_signals() -> Iterator[SimpleNamespace]:
     if threading.current_thread() is not threading.main_thread():
         yield stop  # Python delivers signals to the main thread only
         return
-    before = {signum: signal.signal(signum, note) for signum in (signal.SIGINT, signal.SIGTERM)}
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGUSR1", "SIGHUP") if hasattr(signal, name)]  # Windows lacks two
+    wanted = [getattr(signal, name) for name in names]
+    if "SIGHUP" in names and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        wanted.remove(signal.SIGHUP)
+    before = {signum: signal.signal(signum, note) for signum in wanted}
     try:
         yield stop
     finally:

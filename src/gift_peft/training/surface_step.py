@@ -66,7 +66,7 @@ class SurfaceStep:
     def __init__(
         self,
         model: nn.Module,
-        lambda_c: float = 2.0,
+        lambda_c: float = 1.5,
         lambda_d: float = 1.0,
         micro_batch_size: int = 4,
         accelerator: Accelerator | None = None,

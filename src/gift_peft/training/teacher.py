@@ -5,7 +5,9 @@ self-distillation of a model whose adapter is still zero is exactly zero. Surfac
 proxies, and from what the teacher predicts for the flipped photos and for fills (surface_targets.py).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,26 +18,31 @@ from accelerate.utils import gather_object, parse_flag_from_env
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i, proxies_command
+from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.proxies import (
+    EARLIER,
     SURFACE_SUFFIX,
+    TOLD,
     ProxyStore,
     SurfaceSettings,
     default_proxies_dir,
     difference,
+    has_earlier_set,
     make_header,
     mask_digests,
     picture_digests,
+    proxies_command,
     read_header,
     write_proxies,
     write_surface,
 )
 from gift_peft.dataset.rows import parsed
-from gift_peft.models.identity import teacher_id, teacher_revision
+from gift_peft.evaluation.surface_check import describe, surface_lines
+from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import pixel_settings, resize_mask
 from gift_peft.rules import GroupPictures
-from gift_peft.surface_targets import paint_fills, surface_target
+from gift_peft.surface_targets import SurfaceTarget, paint_fills, surface_target
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -74,7 +81,7 @@ def make_proxies(
         kind (`str`, *optional*): what the teacher predicts, for surface targets; default what its recipe says.
 
     Returns:
-        `Path`: `<proxies_dir>/<teacher>`.
+        `Path`: `<proxies_dir>/<teacher>/<h>x<w>`; files that 0.1.0 made one folder higher stay there while they hold.
 
     Raises:
         ValueError, OSError: in every process, one line naming the file, or group and image: stale proxies or surface
@@ -85,7 +92,8 @@ def make_proxies(
     pinned = teacher_revision(base, revision)
     model = DepthModel.from_pretrained(base, revision=revision, size=size, kind=kind, device=state.device)
     folder = Path(proxies_dir or default_proxies_dir(dataset_path, identity)) / identity
-    place = (base, dataset_path, "x".join(map(str, model.size)), proxies_dir, revision)
+    named = "x".join(map(str, model.size))
+    place = (base, dataset_path, named, proxies_dir, revision)
     command = proxies_command(*place)
     header = make_header(identity, pinned, model.size, pixel_settings(model.processor))
     surface_header, surface_command = {}, ""
@@ -93,19 +101,28 @@ def make_proxies(
         surface_header = header | surface.header() | {"kind": model.known_kind()}
         surface_command = proxies_command(*place, surface) + (f" --kind {kind}" if kind else "")
 
-    def make(row: GroupPictures, path: Path) -> None:
+    earlier = {}
+    if has_earlier_set(folder) and Path(base).is_dir():
+        earlier = {EARLIER: earlier_revision(base)}
+
+    def make(row: GroupPictures, split: str) -> None:
         if surface is not None and row.group_id.endswith(SURFACE_SUFFIX):
             raise ValueError(f"group {row.group_id}: rename it; so the surface targets of another group are called")
-        expected = header | (pixels := picture_digests(row))
-        if (overwrite and surface is None) or not _is_current(path, expected, row.names, command, "proxy"):
-            write_proxies(path, expected, *_predict_row(model, row, batch_size))
+        store = ProxyStore(str(folder), named, split, header | earlier, command)
+        file, pixels = f"{row.group_id}.safetensors", picture_digests(row)
+        known = header | pixels
+        holds = partial(_is_current, names=row.names)
+        if (overwrite and surface is None) or not holds(store.path(file), known | earlier, command, "proxy"):
+            write_proxies(store.place(file), known, *_predict_row(model, row, batch_size))
         if surface is None:
             return
-        target_path = path.with_name(f"{row.group_id}{SURFACE_SUFFIX}.safetensors")
-        expected = surface_header | pixels | mask_digests(row)
-        if overwrite or not _is_current(target_path, expected, row.names, surface_command, "surface target"):
-            proxies, _ = ProxyStore(str(path.parent), header, command).read(row.group_id, row.names, pixels)
-            write_surface(target_path, expected, *_surface_row(model, row, proxies, surface, batch_size))
+        file = f"{row.group_id}{SURFACE_SUFFIX}.safetensors"
+        known = surface_header | pixels | mask_digests(row)
+        if overwrite or not holds(store.path(file), known | earlier, surface_command, "surface target"):
+            proxies, reference = store.read(row.group_id, row.names, pixels)
+            row = replace(row, reference_proxy=reference)
+            *targets, told = _surface_row(model, row, proxies, surface, batch_size)
+            write_surface(store.place(file), known | {TOLD: told}, *targets)
 
     what = "proxies" if surface is None else "surface targets"
     problem = None
@@ -114,15 +131,26 @@ def make_proxies(
             dataset = parsed(load_gift_i(dataset_path, split))
             mine = range(state.process_index, len(dataset), state.num_processes)
             for index in tqdm(mine, desc=f"{what}, {split}", unit="group", delay=2, disable=not state.is_main_process):
-                row = dataset[index]
-                make(row, folder / split / f"{row.group_id}.safetensors")
+                make(dataset[index], split)
     except (ValueError, OSError) as error:
         problem = error
     _raise_everywhere(problem, state)
-    return folder
+    return folder / named
 
 
-def _is_current(path: Path, expected: dict, names: Sequence[str], command: str, what: str) -> bool:
+def told_of_surface(folder: Path, split: str, group_ids: Iterable[str]) -> list[str]:
+    """What the surface targets of a split change, per surface kind: `surface_lines` of their files' headers.
+
+    Args:
+        folder: what `make_proxies` returned. split: of the dataset. group_ids: of its groups; files of an
+            earlier version, which do not tell, are left out.
+    """
+    store = ProxyStore(str(folder.parent), folder.name, split, {}, "")
+    files = ((name, store.path(f"{name}{SURFACE_SUFFIX}.safetensors")) for name in group_ids)
+    return surface_lines((name, read_header(path).get(TOLD, {})) for name, path in files)
+
+
+def _is_current(path: Path, expected: dict, command: str, what: str, names: Sequence[str]) -> bool:
     """Whether a group's proxies, or surface targets, exist and hold; ValueError if they exist and do not."""
     if not path.exists():
         return False
@@ -154,8 +182,8 @@ def _require_finite(prediction: torch.Tensor, row: GroupPictures, name: str) -> 
 
 def _surface_row(
     model: DepthModel, row: GroupPictures, proxies: torch.Tensor, settings: SurfaceSettings, batch_size: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(target, target_flipped), each (N, h, w), of one row and its proxies; ValueError naming the group.
+) -> tuple[torch.Tensor, torch.Tensor, dict]:
+    """(target, target_flipped), each (N, h, w), and what is known of them, of one row; ValueError naming the group.
 
     A row without a pixel to teach at this size keeps its own predictions. Flipped are the pixels that the network
     takes, as training does it: what a resized photo's mirror image shows may differ by rounding.
@@ -164,7 +192,7 @@ def _surface_row(
     valids = np.stack([resize_mask(valid, model.size) for valid in row.valids]) if row.valids else None
     flipped = model.predict(model.inputs(row.images).flip(-1), batch_size)
     if not (masks if valids is None else masks & valids).any():
-        return proxies, flipped
+        return proxies, flipped, {}
     fills: list[torch.Tensor] = []
     fills_flipped: list[torch.Tensor] = []
     for name, image, mask, mirrored in zip(row.names, row.images, row.masks, flipped, strict=True):
@@ -176,7 +204,7 @@ def _surface_row(
             fills_flipped.append(model.predict(pixels.flip(-1), batch_size))
             _require_finite(torch.stack([fills[-1], fills_flipped[-1]]), row, f"a fill of {name}")
 
-    def surface(own: torch.Tensor, painted: list[torch.Tensor], turn: slice) -> torch.Tensor:
+    def surface(own: torch.Tensor, painted: list[torch.Tensor], turn: slice) -> tuple[torch.Tensor, SurfaceTarget]:
         found = surface_target(
             own.numpy(),
             masks[:, :, turn],
@@ -191,10 +219,12 @@ def _surface_row(
         target = torch.from_numpy(found.depth).float()
         if not target.isfinite().all():
             raise ValueError("the surface target has NaN or infinite values")
-        return target
+        return target, found
 
     try:
-        return surface(proxies, fills, slice(None)), surface(flipped, fills_flipped, slice(None, None, -1))
+        target, found = surface(proxies, fills, slice(None))
+        target_flipped, _ = surface(flipped, fills_flipped, slice(None, None, -1))
+        return target, target_flipped, describe(row, proxies, found, model.known_kind())
     except ValueError as error:
         raise ValueError(f"group {row.group_id}: {error}") from None
 

@@ -1,0 +1,95 @@
+"""What is tried: the lines of `trials.py`."""
+
+from dataclasses import asdict, dataclass
+
+from observed import Observed
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How the target maps are made.
+
+    Args:
+        statistic: "auto", "plane", "quantile" (the package's), or a control of `trials.target_maps`.
+        fills: so many of each photo; `observations`: whether the photo's own prediction counts too.
+    """
+
+    statistic: str = "auto"
+    quantile: float = 0.65
+    tau: float = 0.5
+    fills: int = 6
+    observations: bool = True
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training. `rule` None is the paper's objective; `train` and `score` are (set, part) pairs."""
+
+    name: str
+    train: tuple[tuple[str, str], ...]
+    score: tuple[tuple[str, str], ...]
+    rule: Rule | None = Rule()
+    photos: str = "all"
+    count: int = 0
+    lambda_c: float = 2.0
+    lambda_d: float = 0.9
+    rate: float = 2e-4
+    epochs: int = 4
+    updates: int = 0
+    batch: int = 4
+    flips: bool = True
+
+    def describe(self) -> dict:
+        return asdict(self)
+
+
+def part(groups: list[Observed], name: str) -> list[Observed]:
+    """A part of a set: "all", every fourth group, or the others."""
+    return {"all": groups, "fourth": groups[::4], "others": [g for i, g in enumerate(groups) if i % 4]}[name]
+
+
+TRAIN = (("train", "all"),)
+OLD = (("validation", "all"),)
+FRESH = (("fresh_1", "all"), ("fresh_2", "all"), ("fresh_3", "all"))
+
+
+def first(name: str, **options) -> Trial:
+    return Trial(name, TRAIN, OLD, **options)
+
+
+# On training groups and the older validation groups: docs/surface-targets.md.
+CHOSEN = {"lambda_c": 1.4, "epochs": 8}
+HIGH = {"quantile": 0.8, "tau": 0.7}  # without fills
+
+
+def report(name: str, **options) -> Trial:
+    return Trial(name, TRAIN, FRESH, **CHOSEN | options)
+
+
+PAPER = {"rule": None, "lambda_c": 1.0, "flips": False}
+
+OLD_RULE = Rule(**HIGH)
+
+STAGES = {
+    "development": [
+        first("auto", rule=OLD_RULE),
+        first("auto 8 epochs", rule=OLD_RULE, epochs=8),
+        first("auto lambda_c 1 8 epochs", rule=OLD_RULE, lambda_c=1.0, epochs=8),
+        first("auto without fills", rule=Rule(fills=0, **HIGH)),
+        first("auto without fills lambda_c 1.2 8 epochs", rule=Rule(fills=0, **HIGH), lambda_c=1.2, epochs=8),
+        first("consensus", **PAPER),
+        first("consensus 8 epochs", **PAPER, epochs=8),
+    ],
+    "main": [report("surface targets"), report("paper's objective", **PAPER)],
+    "controls": [
+        report("without fills", rule=Rule(fills=0, **HIGH)),
+        report("fills' median (Depth4ToM's label)", rule=Rule("fills' median")),
+        report("group median, static", rule=Rule("group median")),
+        report("mean shift alone", rule=Rule("shift")),
+        report("true depth (upper bound)", rule=Rule("truth")),
+        report("fills alone", rule=Rule(observations=False)),
+        report("quantile for all", rule=Rule("quantile")),
+        report("plane for all", rule=Rule("plane")),
+        report("paper's objective, lambda_c 1.4", **PAPER | {"lambda_c": 1.4}),
+    ],
+}

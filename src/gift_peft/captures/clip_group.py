@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gift_peft.captures.clip import TimeInClip, find_clips, read_time
-from gift_peft.captures.folders import PICTURE_MASKS, files_below, subfolders
+from gift_peft.captures.folders import PICTURE_MASKS, Listing, files_below
 from gift_peft.captures.group_facts import GROUP_FILES, read_facts
 from gift_peft.captures.links import checked
 from gift_peft.captures.masks import MaskSource, find_group_mask, is_group_mask, is_mask_file
@@ -76,4 +76,4 @@ def find_clip_group(folder: Path, root: Path) -> ClipGroup | None:
         raise ValueError(f"group {folder}: two references, {' and '.join(stated[:2])}")
     mask = find_group_mask([path for path in files if is_group_mask(path)], clips[0], root, facts.get("mask_class"))
     reference = checked(references[0], root) if references else None
-    return ClipGroup(folder, clips, mask, subfolders(folder, PICTURE_MASKS), reference, time, facts)
+    return ClipGroup(folder, clips, mask, Listing().subfolders(folder, PICTURE_MASKS), reference, time, facts)

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from gift_peft.captures.folders import same_name, subfolders
+from gift_peft.captures.folders import Listing, same_name
 from gift_peft.captures.foreign import Layout, read_layout
 from gift_peft.captures.group_facts import read_facts
 from gift_peft.captures.links import checked
@@ -111,12 +111,13 @@ def _cleargrasp(raw: Path) -> Iterator[Capture]:
 
 
 def _photos(raw: Path) -> Iterator[Capture]:
-    bases = [raw, *subfolders(raw, TRAIN_FOLDERS)]
-    for folder in subfolders(raw, OTHER_FOLDERS):
+    listing = Listing()
+    bases = [raw, *listing.subfolders(raw, TRAIN_FOLDERS)]
+    for folder in listing.subfolders(raw, OTHER_FOLDERS):
         logger.warning("%s: left out; to measure on, a photo needs a treated reference or a series", folder)
     for base in bases:
-        masks, facts = subfolders(base, MASK_FOLDERS), read_facts(base)
-        for folder in subfolders(base, PHOTO_FOLDERS):
+        masks, facts = listing.subfolders(base, MASK_FOLDERS), read_facts(base)
+        for folder in listing.subfolders(base, PHOTO_FOLDERS):
             if not masks:
                 raise FileNotFoundError(f"{base}: {folder.name}/ and no masks/ beside it")
             drawn = {

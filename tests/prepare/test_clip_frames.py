@@ -7,7 +7,7 @@ from helpers.clips import Making, pushed, views
 from gift_peft.captures.clip import TimeInClip
 from gift_peft.prepare.clip_frames import choose_frames, read_frames
 
-SIZE = (160, 208)
+SIZE = (240, 320)
 
 
 def within(index: int, hold: tuple[int, int]) -> bool:
@@ -128,7 +128,7 @@ def test_several_clips_are_one_scene_of_one_size(tmp_path):
     other = Making((120, 160))
     other.hold(views(8, (120, 160), 1)[0][0])
     paths.append(other.write(tmp_path / "3.mp4"))
-    with pytest.raises(ValueError, match=r"3\.mp4: frames of 160x120, and 0\.mp4 begins with 208x160"):
+    with pytest.raises(ValueError, match=r"3\.mp4: frames of 160x120, and 0\.mp4 begins with 320x240"):
         choose_frames(paths)
 
 

@@ -12,7 +12,7 @@ from gift_peft.prepare import clip_groups
 from gift_peft.prepare.prepare import prepare_gift_i
 from gift_peft.prepare.settings import PrepareSettings
 
-SIZE = (160, 208)
+SIZE = (240, 320)
 
 pytestmark = pytest.mark.usefixtures("fresh_cache")
 

@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gift_peft.prepare.stillness import cells_of, change_above, detail_of, difference, noise_of
+from gift_peft.prepare.stillness import MAX_CHANGE, cells_of, change_above, detail_of, difference, noise_of
 
 LAG = 0.2  # seconds between the frames that are compared, and from a stretch's end to the frames that count
 STEP = 0.03  # seconds; of a faster stream only some frames are looked at
 QUIET = 0.4  # seconds that a still moment lasts at least
-MOVED_CELLS = 0.0008  # share of the cells that may differ in a still frame: noise has its outliers
+MOVED_CELLS = 0.0008  # share of the cells, and one, that may differ in a still frame: noise has its outliers
+KEY_FRAME = 5.0  # times the median, which no part of the picture that changes can raise: still noise
 DRIFT = 2.0  # grey levels within one moment, from its first frame to the others; a slow fade exceeds it
 
 
@@ -67,7 +68,7 @@ class Stillness:
         changes = difference(look.cells, before.cells)
         self._noises.add(noise_of(changes))
         self.noise = self._noises.value
-        self.still = bool((changes > self.threshold).mean() <= MOVED_CELLS)
+        self.still = self._shows_the_same(changes)
         ended = None
         if self.still and self.moment is not None and self._drifts(look.cells):
             ended, self.still = self._finish(), False
@@ -99,8 +100,12 @@ class Stillness:
         return self._recent[0] if old_enough else None
 
     def _drifts(self, cells: np.ndarray) -> bool:
-        limit = max(DRIFT, self.threshold)
-        return bool((difference(cells, self._first) > limit).mean() > MOVED_CELLS)
+        return not self._shows_the_same(difference(cells, self._first), DRIFT)
+
+    def _shows_the_same(self, changes: np.ndarray, least: float = 0.0) -> bool:
+        """Whether differences (h, w) are noise. At a codec's key frames all cells differ a little more."""
+        pumping = min(KEY_FRAME * float(np.median(changes)), MAX_CHANGE)
+        return bool((changes > max(self.threshold, pumping, least)).sum() <= 1 + MOVED_CELLS * changes.size)
 
     def _count(self, look: Look, pixels: np.ndarray) -> None:
         moment = self.moment

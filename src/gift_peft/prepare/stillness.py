@@ -12,7 +12,7 @@ import numpy as np
 
 from gift_peft.prepare.homography import normalize_contrast, transform
 
-CELLS = 96  # along the longer side
+CELLS, LEAST_SIDE = 96, 8  # cells along the longer side; pixels of a cell at least, since codecs work in blocks
 TRACKED_SIDE = 640  # pixels of the longer side, at which the camera's pose is measured
 MIN_CHANGE, MAX_CHANGE = 1.2, 6.0  # grey levels; bounds of what counts as a change from one moment to the next
 OTHER_CONTENT = 3.0  # grey levels; moments further apart also differ by what the light does to shadows
@@ -25,7 +25,7 @@ STRUCTURE_CHANGED = 0.6  # share of the cells that changed, above which it is an
 def cells_of(pixels: np.ndarray) -> np.ndarray:
     """(h, w, 3) float32 means over squares of (H, W, 3) uint8; a rest at the right and lower border is left out."""
     height, width = pixels.shape[:2]
-    side = max(1, round(max(height, width) / CELLS))
+    side = max(LEAST_SIDE, round(max(height, width) / CELLS))
     rows, columns = max(1, height // side), max(1, width // side)
     whole = np.ascontiguousarray(pixels[: rows * side, : columns * side])
     return cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float32)

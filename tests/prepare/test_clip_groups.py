@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers.clips import Making, pushed, views
-from helpers.photos import entry
+from helpers.photos import entry, scene
 from PIL import Image
 
 from gift_peft.cli import main
@@ -104,11 +104,11 @@ def test_what_is_wrong_with_a_clip_rejects_its_group_alone(raw, tmp_path, capsys
 
 def test_a_mask_that_moves_out_of_the_picture_is_named(tmp_path):
     raw = tmp_path / "raw"
-    pictures, _ = views(3, SIZE, 4)
-    pictures[2:] = [pushed(picture, 20) for picture in pictures[2:]]
-    clip_of(raw / "hall/clip.mp4", pictures)
     mask = np.zeros(SIZE, bool)
     mask[40:90, -14:] = True
+    pictures = [np.where(mask[..., None], scene(3000 + index, SIZE), scene(3, SIZE)) for index in range(4)]
+    pictures[2:] = [pushed(picture, 20) for picture in pictures[2:]]
+    clip_of(raw / "hall/clip.mp4", pictures)
     draw(raw / "hall/mask.png", mask)
     report = prepare_gift_i(raw, tmp_path / "out", PrepareSettings())
     second = entry(report, "hall__2")

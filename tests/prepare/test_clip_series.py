@@ -98,7 +98,7 @@ def test_forty_clips(stills, tmp_path):
         indices = [[frame.index for frame in pose.frames] for pose in choice.poses]
         flat = [index for pose in indices for index in pose]
         shown = [any(first <= index <= last for index in flat) for first, last in made.holds]
-        mixed = [index for index in flat if any(first <= index < last for first, last in made.busy)]
+        mixed = [index for index in flat if any(first <= index <= last for first, last in made.busy)]
         views, found = views + len(shown), found + sum(shown)
         chosen, busy = chosen + len(flat), busy + len(mixed)
         if push is None:

@@ -28,7 +28,7 @@ MOST_LOOKS = 48  # moments of one pose that are remembered; of the two most alik
 OTHER_SHARE, OTHER_CELLS = 0.02, 3  # of the target's cells that differ between two observations at least
 FOREIGN_CELLS = 0.004  # share of the cells outside the target that may differ from the other moments'
 MOVED = 0.0008  # mean motion over the diagonal, above which the camera was moved; at least a pixel
-LONE = 1.0  # seconds that the only moment of a pose must last to be a group of its own
+LONE = 0.6  # seconds that the only moment of a pose must last to be a group of its own
 REFERENCE_NEAR = 1.0  # seconds from the time that is stated to the still moment that it means
 
 
@@ -112,6 +112,8 @@ def choose_frames(
         total += seconds
     at = None if reference is None else (0 if reference.clip is None else names.index(reference.clip))
     poses = scene.finish(reference, at, clips)
+    if not poses and scene.notes:
+        raise ValueError(f"{', '.join(map(str, clips))}: no moment can be used; {'; '.join(scene.notes)}")
     if not poses:
         raise ValueError(
             f"{', '.join(map(str, clips))}: no still moment in {total:.1f} s; hold camera and scene still for a "

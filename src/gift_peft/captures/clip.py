@@ -9,13 +9,15 @@ import shlex
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
 from gift_peft.files import is_leftover, write_whole
 from gift_peft.images import natural_key
+
+if TYPE_CHECKING:
+    import cv2
 
 CLIP_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".3gp"}
 MAX_SIDE = 32767  # pixels; beyond, OpenCV cannot warp
@@ -53,6 +55,8 @@ class Clip:
         self.path = Path(path)
         if not self.path.is_file():
             raise FileNotFoundError(f"{self.path}: no such file")
+        import cv2  # here and below, where a clip is read: readers of photos do without
+
         capture = self._open()
         self.frames_stated = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         rate = capture.get(cv2.CAP_PROP_FPS)
@@ -64,6 +68,8 @@ class Clip:
 
         The clip ends where no frame can be decoded any more. ValueError naming it: not even one can be.
         """
+        import cv2
+
         left = None if wanted is None else set(wanted)
         capture, index, before = self._open(), 0, -1.0
         try:
@@ -91,7 +97,9 @@ class Clip:
         """Whether `frames`, all that could be decoded, are clearly fewer than the file states."""
         return frames < self.frames_stated * (1 - TAIL) - 2
 
-    def _open(self) -> cv2.VideoCapture:
+    def _open(self) -> "cv2.VideoCapture":
+        import cv2
+
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else it writes a line for each damaged byte
         capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         if not capture.isOpened():
@@ -114,6 +122,8 @@ class Clip:
 
 def write_frame(path: Path, pixels: np.ndarray) -> None:
     """A frame (H, W, 3), or a mask (H, W), uint8, as a PNG file; ValueError or OSError naming it."""
+    import cv2
+
     there, content = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not there:
         raise ValueError(f"{path}: {pixels.shape} cannot be written as PNG")

@@ -151,7 +151,7 @@ def write_group(group: dict, root: Path) -> dict:
         pictures.check_target()
     least = 1 if split == "train" or reference is not None else 2
     if len({image_digest(image) for image in pictures.images}) < max(least, len(names)):
-        raise ValueError(f"group {group_id}: {len(names)} image{'s' * (len(names) != 1)}; it takes at least {least}, all different")
+        raise ValueError(f"group {group_id}: {len(names)} images; it takes at least {least}, all different")
 
     stems = [f"{index:02d}_{re.sub(r'[^A-Za-z0-9_.-]', '_', Path(name).stem)}" for index, name in enumerate(names)]
     parts = {"images": group["images"], **{kind: getattr(pictures, kind) for kind in ("masks", "valids", "depths")}}

@@ -298,16 +298,19 @@ class _Scene:
         return changed if changed.any() else np.ones_like(changed)
 
     def _without_foreign(self, moments: list[_Found]) -> list[_Found]:
-        """Without moments in which something stands outside the target that the others do not show."""
+        """Without moments in which something stands outside the target that most others do not show."""
         if self.outside is None or self.outside.sum() < 30 or len(moments) < 3:
             return moments
         usual = np.median([found.look.cells for found in moments], axis=0).astype(np.float32)
         limit = max(OTHER_CELLS, FOREIGN_CELLS * self.outside.sum())
-        kept = []
+        kept, notes = [], []
         for found in moments:
             foreign = difference(found.look.cells, usual, self.outside)[self.outside] > 3 * self._content_threshold
             if foreign.sum() <= limit:
                 kept.append(found)
             else:
-                self.notes.append(f"left out: at {found.look.seconds:.1f} s something stands outside the target")
+                notes.append(f"left out: at {found.look.seconds:.1f} s something stands outside the target")
+        if 2 * len(kept) <= len(moments):
+            return moments  # all differ there: it is what the target does to its surroundings, or their own change
+        self.notes += notes
         return kept

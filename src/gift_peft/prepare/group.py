@@ -90,9 +90,9 @@ def decode(capture: Capture, job: Job, entry: GroupEntry) -> tuple[list[Photo], 
             raise ValueError(f"{path}: the name is not valid Unicode text; rename the file")
     decoded = decode_capture(capture, job.settings.empty_masks, may_lack=job.settings.propose_masks)
     entry.warnings += [Remark(code, printable(text)) for code, text in decoded.notes.items()]
-    if capture.split == "train" and len(capture.images) > 1:
+    if capture.split == "train" and (len(capture.images) > 1 or not job.may_be_single):
         check_pair(capture.group_id, len(decoded.kept))
-    elif len(capture.images) == 1 and capture.split == "train":
+    elif capture.split == "train":
         text = "a group of one photo: it trains with --target surface; --target consensus takes two to compare"
         entry.warnings.append(Remark("one_photo", text))
     size = decoded.images[0].size
@@ -293,7 +293,7 @@ def check_left(count: int, reference: Photo | None, job: Job, entry: GroupEntry)
     taken = sum(frame.role == "observation" for frame in entry.frames)
     try:
         check_count(job.group_id, count, job.split, reference is not None and not reference.dropped)
-        if job.split == "train" and taken > 1:
+        if job.split == "train" and (taken > 1 or not job.may_be_single):
             check_pair(job.group_id, count)
     except ValueError:
         frames = [frame for frame in entry.frames if frame.status == "dropped"]

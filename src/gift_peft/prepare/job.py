@@ -8,6 +8,7 @@ from pathlib import Path
 
 from gift_peft.captures.foreign import Layout
 from gift_peft.captures.group_facts import GROUP_FILES
+from gift_peft.captures.known_datasets import KnownLayout
 from gift_peft.captures.tree import Capture, read_capture
 from gift_peft.prepare.entries import Remark
 from gift_peft.prepare.settings import PrepareSettings
@@ -60,6 +61,11 @@ class Job:
         if not isinstance(self.settings.layout, Layout):
             return self.source.name
         return self.settings.layout.group_id(self.source, self.split, self.raw)
+
+    @property
+    def may_be_single(self) -> bool:
+        """Whether a train group of one photo is meant: in other raw trees the others were forgotten."""
+        return self.clip_folder is not None or isinstance(self.settings.layout, KnownLayout)
 
     def read(self) -> Capture:
         if self.failure is not None:

@@ -18,7 +18,7 @@ from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import Job, capture_digest, group_choices, printable
 from gift_peft.prepare.prepare import list_jobs
 from gift_peft.prepare.settings import PrepareSettings
-from gift_peft.rules import SPLITS, check_count, check_group_id
+from gift_peft.rules import SPLITS, check_count, check_group_id, check_pair
 
 
 def tell_plan(raw: Path, out: Path, settings: PrepareSettings, num_proc: int) -> int:
@@ -85,6 +85,8 @@ def _read(job: Job) -> Capture:
     if not job.settings.propose_masks:
         check_masks(capture)
     check_count(capture.group_id, len(capture.images), capture.split, capture.reference is not None)
+    if capture.split == "train" and not job.may_be_single:
+        check_pair(capture.group_id, len(capture.images))
     return capture
 
 

@@ -1,4 +1,4 @@
-"""Clips and coach over many synthesized clips of rendered groups and real photos: how much is found, and what is not.
+"""Many synthesized clips of rendered groups and real photos: how much is found, and what is not.
 
 `pytest -m slow -s tests/prepare/test_clip_series.py` prints the figures; the seeds are the numbers of the clips.
 """
@@ -10,17 +10,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.clips import RATE, Making, pushed
+from helpers.clips import Making, pushed
 from PIL import Image
 
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.prepare.clip_frames import choose_frames
-from gift_peft.prepare.coach import Coach
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 SIZE = (270, 480)  # height, width
 CLIPS = 40
-FAULTS = ("moved", "blurred", "over_exposed", "unchanged", None)
 
 pytestmark = pytest.mark.slow
 
@@ -114,52 +112,3 @@ def test_forty_clips(stills, tmp_path):
         f"rightly; {frames / spent:.0f} frames a second at {SIZE[1]}x{SIZE[0]}"
     )
     assert found >= 0.95 * views and busy == 0 and split == pushes
-
-
-def spoil(picture: np.ndarray, fault: str | None, before: np.ndarray) -> np.ndarray:
-    if fault == "moved":
-        return pushed(picture, 3)
-    if fault == "blurred":
-        return cv2.GaussianBlur(picture, (0, 0), 2.0)
-    if fault == "over_exposed":
-        return np.clip(picture * 2.5, 0, 255)
-    return before if fault == "unchanged" else picture
-
-
-def test_the_coach_on_faults_and_without(stills):
-    told = wanted = spoiled = alarms = quiet = frames = 0
-    spent = 0.0
-    for seed in range(CLIPS):
-        rng = np.random.default_rng(1000 + seed)
-        pictures, mask = stills[(7 * seed) % len(stills)]
-        shown = distinct(pictures, mask, rng, 4)
-        if len(shown) < 2:
-            continue
-        fault = FAULTS[seed % len(FAULTS)]
-        made = Making(SIZE, seed, noise=float(rng.uniform(1, 4)), drift=float(rng.uniform(-0.01, 0.01)))
-        for number, picture in enumerate(shown):
-            last = number == len(shown) - 1
-            made.hold(spoil(picture, fault, shown[number - 1]) if last else picture, 1.4)
-            if not last:
-                made.cross(picture, (0, 40), 0.5)
-        coach = Coach(mask if seed % 2 else None)
-        start = time.process_time()
-        advices = [coach.see(k, k / RATE, frame[..., ::-1].copy()) for k, frame in enumerate(made.frames)]
-        spent += time.process_time() - start
-        frames += len(made.frames)
-        border = made.holds[-1][0]
-        good = advices[:border] if fault else advices
-        alarms += sum(bool(advice.warnings) for advice in good)
-        quiet += len(good)
-        if fault:
-            wanted += 1
-            warned = any(fault in {item.code for item in advice.warnings} for advice in advices[border:])
-            taken = any(advice.photo is not None for advice in advices[border:])
-            told, spoiled = told + warned, spoiled + taken
-            if not warned or taken:
-                print(f"clip {seed}: {fault} told {warned}, photo taken {taken}")
-    print(
-        f"{told} of {wanted} faults told, {spoiled} photos with a fault taken; warnings in {alarms} of {quiet} good "
-        f"frames; {frames / spent:.0f} frames a second at {SIZE[1]}x{SIZE[0]}"
-    )
-    assert told >= 0.95 * wanted and spoiled <= 0.05 * wanted and alarms < 0.02 * quiet

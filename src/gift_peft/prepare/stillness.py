@@ -68,14 +68,6 @@ def same_light(cells: np.ndarray, goal: np.ndarray, region: np.ndarray | None = 
     return result
 
 
-def light_gain(cells: np.ndarray, goal: np.ndarray, region: np.ndarray | None = None) -> float:
-    """By what the brightness of `cells` is multiplied to give that of `goal`, both (h, w, 3): the median of cells."""
-    chosen = slice(None) if region is None or region.sum() < 30 else region
-    here, there = cells[chosen].ravel(), goal[chosen].ravel()
-    usable = (here > 8) & (here < 245) & (there > 8) & (there < 245)
-    return float(np.median(there[usable] / here[usable])) if usable.sum() >= 30 else 1.0
-
-
 def difference(cells: np.ndarray, goal: np.ndarray, region: np.ndarray | None = None) -> np.ndarray:
     """(h, w) grey levels by which each cell and its neighbors differ, in the color that differs most, the light apart.
 

@@ -15,6 +15,14 @@ def write(path, text):
     return ["--config", str(path)]
 
 
+@pytest.mark.parametrize(
+    ("words", "value"), [([], None), (["--channels_last"], True), (["--channels-last=no"], False)]
+)
+def test_channels_last_is_a_flag_with_a_third_state(words, value):
+    given = ["--model_name_or_path=b", "--dataset_name=d", "--output_dir=o"]
+    assert parse_arguments([*given, *words]).channels_last is value
+
+
 def test_defaults_are_the_papers():
     args = parse_arguments(REQUIRED)
     assert (args.learning_rate, args.weight_decay, args.num_train_epochs) == (2e-5, 0, 50)

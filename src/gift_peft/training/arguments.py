@@ -316,6 +316,7 @@ def make_parser() -> OptionParser:
     # HfArgumentParser knows no groups, so its options are moved into them.
     parser.usage = "%(prog)s --base ID --dataset ID --out DIR [options]"
     actions = {action.dest: action for action in parser._actions}
+    actions["channels_last"].nargs, actions["channels_last"].const = "?", True  # alone it means yes, as plain flags do
     group = parser
     for name in _names():
         if name in SECTIONS:

@@ -28,7 +28,7 @@ MOST_LOOKS = 48  # moments of one pose that are remembered; of the two most alik
 OTHER_SHARE, OTHER_CELLS = 0.02, 3  # of the target's cells that differ between two observations at least
 FOREIGN_CELLS = 0.004  # share of the cells outside the target that may differ from the other moments'
 MOVED = 0.0008  # mean motion over the diagonal, above which the camera was moved; at least a pixel
-LONE = 0.6  # seconds that the only moment of a pose must last to be a group of its own
+LONE = 0.6  # seconds of stillness that a pose with a single view must have to be a group of its own
 REFERENCE_NEAR = 1.0  # seconds from the time that is stated to the still moment that it means
 
 
@@ -223,7 +223,8 @@ class _Scene:
             if treated in moments:
                 owner = pose if frames or not poses else poses[-1]
                 owner.reference = treated.chosen
-            if len(frames) == 1 and len(self.poses) > 1 and frames[0].lasted < LONE and pose.reference is None:
+            brief = len(frames) == 1 and sum(found.lasted for found in moments) < LONE
+            if brief and len(self.poses) > 1 and pose.reference is None:
                 self.notes.append(
                     f"left out: a moment at {frames[0].look.seconds:.1f} s, alone in its pose of the camera"
                 )

@@ -18,7 +18,7 @@ from helpers.orderings import write_layered, write_md3k
 from helpers.tiny import SIZE, write_raw_tree
 
 from gift_peft.captures.foreign import read_layout
-from gift_peft.captures.tree import GROUP_KEYS
+from gift_peft.captures.group_facts import GROUP_KEYS
 from gift_peft.cli import VERBS, main
 from gift_peft.training.arguments import parse_arguments
 

@@ -3,8 +3,9 @@
 `RAW[/train|/validation]/<group>/` holds the observations, in folders of their own if need be, their masks in any form
 that `masks.py` reads or one for all of them (`mask.*`), perhaps the treated reference (`reference.*`, `ref.*`,
 `ref_*`) and `group.yaml` (`surface`, `notes`, `mask_class`, `empty_masks`, `static_rig`; `synthesized` marks what
-`gift-peft synthesize` made). Without split folders, groups with a reference are validation and the others train.
-`GiftI` reads it as it is; `gift-peft prepare` makes a prepared folder of it.
+`gift-peft synthesize` made; `reference` is a time in a clip). Without split folders, groups with a reference are
+validation and the others train. `GiftI` reads it as it is; `gift-peft prepare` makes a prepared folder of it, and
+photos of a clip.
 """
 
 import io
@@ -16,7 +17,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from gift_peft.captures.clip import explain_clip, find_clips
 from gift_peft.captures.folders import Listing, files_below, holds_no_photos
+from gift_peft.captures.group_facts import read_facts
 from gift_peft.captures.masks import (
     MaskSource,
     explain_missing,
@@ -25,7 +28,6 @@ from gift_peft.captures.masks import (
     is_group_mask,
     is_mask_file,
 )
-from gift_peft.files import read_yaml
 from gift_peft.images import (
     hidden_turn,
     image_digest,
@@ -35,13 +37,10 @@ from gift_peft.images import (
     read_image,
     skipped_files,
 )
-from gift_peft.rules import SPLITS, SURFACES, GroupPictures, check_count
+from gift_peft.rules import SPLITS, GroupPictures, check_count
 
 logger = logging.getLogger(__name__)
 
-GROUP_KEYS = {"surface", "notes", "mask_class", "empty_masks", "static_rig", "synthesized"}
-GROUP_FILES = ("group.yaml", "group.yml")
-EMPTY_MASKS = ("refuse", "allow")  # a photo without a target in a group whose others have one
 REFERENCE = re.compile(r"ref(erence)?([^a-z].*)?", re.IGNORECASE)  # but not reflection_1
 
 
@@ -59,6 +58,7 @@ class Capture:
         common (`MaskSource`, *optional*): `mask.*`, for the observations that have none of their own.
         skipped (`list[Path]`): files of the folder that are not read.
         root (`Path`, *optional*): of the tree.
+        depth (`Path`, *optional*): measured depth of the treated surface, as the reference's camera sees it.
     """
 
     folder: Path
@@ -71,6 +71,7 @@ class Capture:
     common: MaskSource | None = None
     skipped: list[Path] = field(default_factory=list)
     root: Path | None = None
+    depth: Path | None = None
 
     def name(self, path: Path) -> str:
         """How an image is called in the dataset: its path inside the group's folder."""
@@ -154,13 +155,15 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
     files = sorted(files_below(folder))
     pictures = _photos(files, folder)
     skipped = [path for path in skipped_files(files) if not is_mask_file(path, folder)]
-    references = [path for path in pictures if _is_reference(path)]
+    references = [path for path in pictures if is_reference(path)]
     if len(references) > 1:
         raise ValueError(f"group {folder}: two references, {' and '.join(path.name for path in references[:2])}")
-    if not references and (unread := [path for path in skipped if _is_reference(path)]):
+    if not references and (unread := [path for path in skipped if is_reference(path)]):
         # Left out without a word, its group would train.
         raise ValueError(f"group {folder}: the treated reference cannot be read; {name_skipped([unread[0].name])}")
     images = [path for path in pictures if path not in references]
+    if not images and (clips := find_clips(files)):
+        raise ValueError(explain_clip(folder, clips, root))
     if not images:
         told = f"; {name_skipped([path.name for path in skipped])}" if skipped else ""
         raise FileNotFoundError(f"group folder {folder} holds no images{told}")
@@ -170,7 +173,11 @@ def read_capture(folder: Path, split: str, root: Path) -> Capture:
             raise ValueError(
                 f"{path} and {by_stem[path.with_suffix('')].name} would share one mask; rename one of them"
             )
-    facts = _facts(folder)
+    facts = read_facts(folder)
+    if "reference" in facts:
+        raise ValueError(
+            f"group {folder}: `reference` in group.yaml is a time in a clip, and here are photos; remove it"
+        )
     if split == "validation" and "synthesized" in facts:
         raise ValueError(f"group {folder}: painted copies of one photo (gift-peft synthesize) are for training only")
     mask_class = facts.get("mask_class")
@@ -345,7 +352,7 @@ def _photos(files: list[Path], folder: Path) -> list[Path]:
     return sorted(photos, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 
-def _is_reference(path: Path) -> bool:
+def is_reference(path: Path) -> bool:
     return REFERENCE.fullmatch(path.stem) is not None and path.suffix != ""
 
 
@@ -354,37 +361,9 @@ def _has_reference(folder: Path) -> bool:
     try:
         files = list(files_below(folder))
         unread = skipped_files(files)  # a reference in HEIC: reading the group says what to install
-        return any(map(_is_reference, (*_photos(files, folder), *unread)))
+        return any(map(is_reference, (*_photos(files, folder), *unread))) or "reference" in read_facts(folder)
     except (OSError, ValueError):
         return False
-
-
-def _facts(folder: Path) -> dict:
-    found = [folder / name for name in GROUP_FILES if (folder / name).exists()]
-    if not found:
-        return {}
-    if len(found) > 1:
-        raise ValueError(f"{found[0]} and {found[1].name}: one of them is enough; remove the other")
-    path = found[0]
-    facts = read_yaml(path)
-    if not facts.keys() <= GROUP_KEYS:
-        raise ValueError(f"{path}: it may have the keys {', '.join(sorted(GROUP_KEYS))} and no others")
-    if facts.get("surface") is not None:
-        facts["surface"] = str(facts["surface"]).lower()
-    if facts.get("surface") not in (None, *SURFACES):
-        raise ValueError(f"{path}: surface {facts['surface']!r}; it is one of {', '.join(SURFACES)}")
-    classes = facts.get("mask_class", [])
-    for value in classes if isinstance(classes, list) else [classes]:
-        if isinstance(value, bool) or not isinstance(value, int | str):
-            what = "the target's value or label in the masks, or a list; yes, no, on and off need quotes"
-            raise ValueError(f"{path}: mask_class {classes!r}; it is {what}")
-    if facts.get("empty_masks", "refuse") not in EMPTY_MASKS:
-        raise ValueError(f"{path}: empty_masks {facts['empty_masks']!r}; it is one of {', '.join(EMPTY_MASKS)}")
-    if not isinstance(facts.get("static_rig", False), bool):
-        raise ValueError(f"{path}: static_rig {facts['static_rig']!r}; it is true or false")
-    if not isinstance(facts.get("synthesized", {}), dict):
-        raise ValueError(f"{path}: synthesized {facts['synthesized']!r}; it is what gift-peft synthesize wrote there")
-    return facts
 
 
 def _mask_item(source: MaskSource | None, mask: np.ndarray) -> str | dict:

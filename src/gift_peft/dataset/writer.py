@@ -149,7 +149,7 @@ def write_group(group: dict, root: Path) -> dict:
     pictures = parse_group({**group, "image_names": names}, _rgb, _mask, _depth)
     if split == "train":
         pictures.check_target()
-    least = 1 if split == "validation" and reference is not None else 2
+    least = 1 if split == "train" or reference is not None else 2
     if len({image_digest(image) for image in pictures.images}) < max(least, len(names)):
         raise ValueError(f"group {group_id}: {len(names)} images; it takes at least {least}, all different")
 

@@ -1,102 +1,33 @@
 """One group from photos to a checked, registered group on disk, in four steps: decode, register, check, write.
 
-`prepare.py` runs this for every group of a tree. Each picture is a `Photo`: its pixels, its mask, the map that
-registers it, and its entry in the report.
+`prepare.py` runs this for every group of a tree.
 """
 
 import math
-import os
 import shutil
-from dataclasses import asdict, dataclass, fields
-from functools import cached_property
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image
 
+from gift_peft.captures.measured_depth import read_measured_depth
 from gift_peft.captures.tree import Capture, Decoded, check_masks, decode_capture
 from gift_peft.dataset.writer import write_group
 from gift_peft.prepare.entries import FrameEntry, GroupEntry, GroupQuality, ReferenceQuality, Remark
 from gift_peft.prepare.frame_bar import note_frame
 from gift_peft.prepare.job import Job, Outcome, capture_digest, group_choices, printable, proposal_choices
 from gift_peft.prepare.matching import Frame
+from gift_peft.prepare.photo import Photo, Rejection
 from gift_peft.prepare.quality import SmallFrame, check_frames, check_group_change, pairwise_changes
-from gift_peft.prepare.registration import Registration, register, valid_area, warp
+from gift_peft.prepare.registration import register, warp
 from gift_peft.prepare.settings import QualitySettings
 from gift_peft.rules import check_count, check_group_id, check_pair
 
 MIN_SIDE = 32  # pixels; below, neither features nor local contrast mean anything
 # Remarks that count for a treated reference; inside the target it differs by design.
 ABOUT_REFERENCE = ("too_dark", "too_bright", "another_scene", "outside_change")
-
-
-class Rejection(Exception):
-    """Ends the work on a group; carries the reason."""
-
-    def __init__(self, code: str, text: str):
-        super().__init__(text)
-        self.reason = Remark(code, text)
-
-
-@dataclass
-class Photo:
-    """One picture of a group, an observation or the treated reference.
-
-    Args:
-        entry (`FrameEntry`): its part of the report, which says whether it is dropped or warped.
-        source (`Path`): its file, which is copied if the pixels stay as they are.
-        pixels (`np.ndarray`): (H, W, 3) uint8.
-        mask (`np.ndarray`, *optional*): (H, W) bool, as drawn or proposed.
-        matrix (`np.ndarray`, *optional*): (3, 3), to the target frame; None if registration dropped it.
-    """
-
-    entry: FrameEntry
-    source: Path
-    pixels: np.ndarray
-    mask: np.ndarray | None
-    matrix: np.ndarray | None = None
-
-    @property
-    def dropped(self) -> bool:
-        return self.entry.status == "dropped"
-
-    @property
-    def warped(self) -> bool:
-        return self.entry.status == "warped"
-
-    @property
-    def map(self) -> np.ndarray:
-        """(3, 3): from its pixels to the target frame's, once it is registered."""
-        return self.matrix if self.warped else np.eye(3)
-
-    @property
-    def gray(self) -> np.ndarray:
-        return cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY)
-
-    @property
-    def picture(self) -> Path | Image.Image:
-        """What is written: the file as it is, or the warped pixels."""
-        return Image.fromarray(self.registered(self.pixels)) if self.warped else self.source
-
-    def decide(self, result: Registration) -> None:
-        entry, self.matrix = self.entry, result.matrix
-        entry.status, entry.reasons, entry.warnings = result.status, result.reasons, result.warnings
-        entry.registration = result.figures
-
-    def registered(self, array: np.ndarray) -> np.ndarray:
-        """The picture, its mask or another map of it as the target frame's camera sees it."""
-        return warp(array, self.matrix) if self.warped else array
-
-    @cached_property
-    def valid(self) -> np.ndarray:
-        """(H, W) bool: where it has pixels once it is registered. Ask for it after that."""
-        height, width = self.pixels.shape[:2]
-        return valid_area(self.matrix, (width, height)) if self.warped else np.ones((height, width), bool)
-
-    def small(self, mask: np.ndarray) -> SmallFrame:
-        """For comparisons; `mask` (H, W) bool is registered."""
-        return SmallFrame(cv2.cvtColor(self.registered(self.pixels), cv2.COLOR_RGB2GRAY), mask, self.valid)
 
 
 def prepare_group(job: Job) -> Outcome:
@@ -115,8 +46,7 @@ def prepare_group(job: Job) -> Outcome:
     except Rejection as rejection:
         entry.reject(rejection.reason)
     except (OSError, ValueError, cv2.error, MemoryError, RecursionError) as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        entry.reject(Remark("unreadable", printable(text.replace(f"{job.raw}{os.sep}", ""))))
+        entry.reject(Remark("unreadable", job.readable(error)))
         digest = None  # it may be a passing trouble (permissions, memory): try again next time
     return Outcome(digest, entry.as_json(), row, proposed_from)
 
@@ -124,7 +54,10 @@ def prepare_group(job: Job) -> Outcome:
 def _make(capture: Capture, job: Job, entry: GroupEntry, proposed_from: str) -> dict:
     """The staged group's metadata row."""
     if not job.settings.propose_masks:
-        check_masks(capture)
+        try:
+            check_masks(capture)
+        except FileNotFoundError as error:
+            raise Rejection("masks_missing", job.readable(error)) from None
     photos, reference, decoded = decode(capture, job, entry)
     entry.target_frame = photos[-1].entry.name
     static = job.settings.static_rig or capture.facts.get("static_rig", False)
@@ -134,12 +67,14 @@ def _make(capture: Capture, job: Job, entry: GroupEntry, proposed_from: str) -> 
         propose_masks(photos, reference, static, job, entry, proposed_from)
     register_photos(photos, reference, static, job)
     check(photos, reference, job, entry)
-    return write([photo for photo in photos if not photo.dropped], reference, entry.surface, job)
+    depth = None if capture.depth is None else read_measured_depth(capture.depth, photos[-1].pixels.shape[:2])
+    return write([photo for photo in photos if not photo.dropped], reference, depth, entry.surface, job)
 
 
 def list_frames(capture: Capture, job: Job, entry: GroupEntry) -> None:
     """The group's facts and its pictures as the report lists them, before any is decoded."""
     notes = capture.facts.get("notes")
+    entry.warnings += job.remarks
     entry.surface, entry.notes = capture.facts.get("surface"), None if notes is None else str(notes)
     paths = [(path, "observation") for path in capture.images]
     paths += [(capture.reference, "reference")] if capture.reference is not None else []
@@ -155,8 +90,11 @@ def decode(capture: Capture, job: Job, entry: GroupEntry) -> tuple[list[Photo], 
             raise ValueError(f"{path}: the name is not valid Unicode text; rename the file")
     decoded = decode_capture(capture, job.settings.empty_masks, may_lack=job.settings.propose_masks)
     entry.warnings += [Remark(code, printable(text)) for code, text in decoded.notes.items()]
-    if capture.split == "train":
+    if capture.split == "train" and (len(capture.images) > 1 or not job.may_be_single):
         check_pair(capture.group_id, len(decoded.kept))
+    elif capture.split == "train":
+        text = "a group of one photo: it trains with --target surface; --target consensus takes two to compare"
+        entry.warnings.append(Remark("one_photo", text))
     size = decoded.images[0].size
     entry.size = list(size)
     if min(size) < MIN_SIDE:
@@ -352,20 +290,25 @@ def check_left(count: int, reference: Photo | None, job: Job, entry: GroupEntry)
     if reference is not None and reference.dropped:
         text = "; ".join(item.text for item in reference.entry.reasons)
         entry.warnings.append(Remark("reference_dropped", f"the treated reference is dropped: {text}"))
+    taken = sum(frame.role == "observation" for frame in entry.frames)
     try:
         check_count(job.group_id, count, job.split, reference is not None and not reference.dropped)
-        if job.split == "train":
+        if job.split == "train" and (taken > 1 or not job.may_be_single):
             check_pair(job.group_id, count)
     except ValueError:
         frames = [frame for frame in entry.frames if frame.status == "dropped"]
         dropped = "; ".join(f"{frame.name}: {', '.join(item.text for item in frame.reasons)}" for frame in frames)
-        taken = sum(frame.role == "observation" for frame in entry.frames)
         text = f"{count} of {taken} observations are left; dropped are {dropped}"
         raise Rejection("too_few_frames", text) from None
 
 
-def write(photos: list[Photo], reference: Photo | None, surface: str | None, job: Job) -> dict:
-    """Stage the group of these photos, note their files in their entries, and return the metadata row."""
+def write(
+    photos: list[Photo], reference: Photo | None, depth: np.ndarray | None, surface: str | None, job: Job
+) -> dict:
+    """Stage the group of these photos, note their files in their entries, and return the metadata row.
+
+    `depth` (H, W) uint16 in mm is of the treated surface as the reference's camera sees it.
+    """
     treated = [] if reference is None or reference.dropped else [reference]
     valids = []
     if any(photo.warped for photo in (*photos, *treated)):
@@ -380,6 +323,7 @@ def write(photos: list[Photo], reference: Photo | None, surface: str | None, job
             "images": [photo.picture for photo in photos],
             "masks": [photo.registered(photo.mask) for photo in photos],
             "valids": valids,
+            "depths": [treated[0].registered(depth)] * len(photos) if depth is not None and treated else [],
             "reference": treated[0].picture if treated else None,
         },
         job.staging,

@@ -21,6 +21,7 @@ from gift_peft.captures.tree import find_groups
 from gift_peft.dataset.writer import write_card, write_rows
 from gift_peft.files import remove_files, strangers, write_whole
 from gift_peft.options import package_version
+from gift_peft.prepare.clip_groups import replace_clips
 from gift_peft.prepare.entries import Statistics
 from gift_peft.prepare.frame_bar import FrameBar
 from gift_peft.prepare.group import prepare_group
@@ -71,6 +72,9 @@ def prepare_gift_i(
         check_card("prepare", out, STATE)
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir()
+        jobs = replace_clips(jobs, out / STATE / "clips", num_proc)
+        _check_names(jobs)
+        jobs = [_with_record(job, _read_record(out, job), out) for job in jobs]
         report, rows = _make_groups(raw, out, settings, jobs, num_proc)
         shutil.rmtree(staging, ignore_errors=True)
         if any(rows.values()):

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gift_peft.captures.tree import Capture, check_masks
+from gift_peft.prepare.clip_groups import is_clip_job
 from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import Job, capture_digest, group_choices, printable
 from gift_peft.prepare.prepare import list_jobs
@@ -29,8 +30,12 @@ def tell_plan(raw: Path, out: Path, settings: PrepareSettings, num_proc: int) ->
     jobs = list_jobs(raw, out, settings)
     rejected: dict[str, str] = {}
     new: list[Planned] = []
+    clips: list[str] = []
     done = 0
     for job in jobs:
+        if is_clip_job(job):
+            clips.append(f"{job.split}/{printable(job.group_id)}")
+            continue
         try:
             capture = _read(job)
         except (OSError, ValueError, RecursionError) as error:
@@ -53,6 +58,8 @@ def tell_plan(raw: Path, out: Path, settings: PrepareSettings, num_proc: int) ->
         what = "and accepted if they stand out enough" if settings.accept_proposed_masks else "for you to look at"
         names = ", ".join(f"{one.job.split}/{one.job.group_id} ({one.without_mask})" for one in bare)
         print(f"Masks would be proposed, {what}: {names}")
+    if clips:
+        print(f"Clips, of which at most {settings.max_frames} frames a pose would be chosen: {', '.join(clips)}")
     if new:
         print(_estimate(new, out, num_proc))
     for name, text in rejected.items():
@@ -78,7 +85,7 @@ def _read(job: Job) -> Capture:
     if not job.settings.propose_masks:
         check_masks(capture)
     check_count(capture.group_id, len(capture.images), capture.split, capture.reference is not None)
-    if capture.split == "train":
+    if capture.split == "train" and not job.may_be_single:
         check_pair(capture.group_id, len(capture.images))
     return capture
 

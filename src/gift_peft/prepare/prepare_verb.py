@@ -4,18 +4,21 @@ A YAML file (`--config`) may state the same names; the command line wins.
 """
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import Field, fields
+from importlib.util import find_spec
 from pathlib import Path
 
-from gift_peft.captures.foreign import read_layout
+from gift_peft.captures.known_datasets import choose_layout
 from gift_peft.files import read_yaml
 from gift_peft.options import OptionParser, did_you_mean, number
 from gift_peft.prepare.settings import PrepareSettings, QualitySettings, RegistrationSettings
 
 PARTS = {"registration": RegistrationSettings, "quality": QualitySettings}
-NOTES = ("one_mask", "skipped_files", "exif_turned")  # what is said at the end, beside the report
+NOTES = ("clip", "one_mask", "skipped_files", "exif_turned")  # what is said at the end, beside the report
+EXAMPLE_BASE = "depth-anything/Depth-Anything-V2-Small-hf"
 DESCRIPTION = """From a folder of photos to a checked GIFT-I dataset: register, check, write, report.
 
 Exit code: 0 if every group is in OUT, 3 if some were rejected (the report says why), 1 if none could be made, or RAW
@@ -57,9 +60,38 @@ def run(argv: Sequence[str]) -> int:
     page = Path(args.out) / "report.html"
     print(f"Report: {page}")
     kept = sum(found["groups"] for found in report["statistics"].values())
+    _tell_masks(report["groups"], args.raw, args.out)
     if not kept:
         raise ValueError(f"no group could be prepared; {page} says why")
+    print(f"Next: {_next_command(report['statistics'], args.out)}")
     return 0 if kept == len(report["groups"]) else 3
+
+
+def _tell_masks(groups: list[dict], raw: str, out: str) -> None:
+    """How the masks that are missing may be drawn."""
+    lacking = [entry for entry in groups if any(reason["code"] == "masks_missing" for reason in entry["reasons"])]
+    if not lacking:
+        return
+    proposing = shlex.join(["gift-peft", "prepare", raw, out, "--propose-masks"])
+    drawing = f"`{shlex.join(['gift-peft', 'studio', raw])}` draws them in a browser, or " if _has_studio() else ""
+    one = len(lacking) == 1
+    print(
+        f"{'A group lacks' if one else f'{len(lacking)} groups lack'} masks: {drawing}`{proposing}` draws first ones; "
+        "one mask for a group is enough, as mask.png beside its photos (docs/masks.md)"
+    )
+
+
+def _has_studio() -> bool:
+    return find_spec("gift_peft.studio") is not None
+
+
+def _next_command(statistics: dict[str, dict], out: str) -> str:
+    """What to type next, for this dataset: train, or without groups to train on evaluate."""
+    train = statistics.get("train", {"groups": 0})
+    if not train["groups"]:
+        return shlex.join(["gift-peft", "evaluate", "--base", EXAMPLE_BASE, "--dataset", out])
+    words = ["gift-peft", "train", "--base", EXAMPLE_BASE, "--dataset", out, "--out", f"{Path(out)}-run"]
+    return shlex.join([*words, *(["--target", "surface"] if train["group_size"]["min"] == 1 else [])])
 
 
 def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
@@ -76,7 +108,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     parts = {name: kind(**{key: values.pop(key) for key in _options(kind)}) for name, kind in PARTS.items()}
     choices = {key: values.pop(key) for key in _options(PrepareSettings)}
     choices["propose_masks"] |= choices["accept_proposed_masks"] or choices["refine"] is not None
-    choices["layout"] = None if choices["layout"] is None else read_layout(choices["layout"])
+    choices["layout"] = None if choices["layout"] is None else choose_layout(choices["layout"])
     return argparse.Namespace(settings=PrepareSettings(**parts, **choices), **values)
 
 

@@ -4,7 +4,8 @@ import math
 from dataclasses import dataclass, field
 
 from gift_peft.captures.foreign import Layout
-from gift_peft.captures.tree import EMPTY_MASKS
+from gift_peft.captures.group_facts import EMPTY_MASKS
+from gift_peft.captures.known_datasets import KnownLayout
 
 
 def _option(text: str, metavar: str = "X", least: int = 0) -> dict:
@@ -96,6 +97,12 @@ class PrepareSettings:
     )
     min_proposal_score: float = _arg("score (0 to 1) below which a proposed mask is never accepted", 0.5)
     refine: str | None = _arg("refine the borders of the proposals with SAM 2", None, metavar="sam2:MODEL")
-    layout: Layout | None = field(
-        default=None, metadata=_option("YAML file that says where RGB and mask files lie", metavar="FILE")
+    max_frames: int = _arg("photos that are chosen of a clip, for each pose of the camera", 12, metavar="N", least=1)
+    layout: Layout | KnownLayout | None = field(
+        default=None,
+        metadata=_option(
+            "how RAW is laid out: booster, cleargrasp, photos (images/ and masks/), or a YAML file that says where "
+            "RGB and mask files lie",
+            metavar="NAME|FILE",
+        ),
     )

@@ -3,12 +3,14 @@
 import math
 import os
 import shutil
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from helpers.tiny import tiny_model
 
 from gift_peft import get_gift_model, load_gift_i, save_adapter
+from gift_peft.cli import VERBS
 from gift_peft.files import (
     check_inputs_stay,
     check_replaceable,
@@ -19,11 +21,16 @@ from gift_peft.files import (
     reason,
     remove_files,
     strangers,
+    unfetched,
     whole_folder,
     write_whole,
 )
 from gift_peft.models.convert import convert_vggt
 from gift_peft.models.identity import check_base_name
+from gift_peft.models.loading import load_base
+from gift_peft.reports import model_card, targets_page
+
+ROOT = Path(__file__).parents[1]
 
 
 def test_a_folder_is_whole_or_absent(tmp_path):
@@ -101,6 +108,24 @@ def test_files_are_removed_with_the_folders_that_they_leave_empty(tmp_path):
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["a", "a/c", "a/c/1"]
 
 
+def test_a_file_of_another_is_not_written_over(tmp_path):
+    """Both verbs that take the name of one file say so before they load anything: there is no base and no dataset."""
+    card = ["report", str(ROOT / "examples/vggt_1b.yaml"), "--model-card"]
+    page = ["proxies", "--base", "nothing", "--dataset", "nothing", "--target", "surface", "--page"]
+    for command in (card, page):
+        mine = tmp_path / "mine.txt"
+        mine.write_text("mine")
+        for path, error, message in ((mine, ValueError, "is kept"), (tmp_path, IsADirectoryError, "is a folder")):
+            with pytest.raises(error, match=f"{command[-1]} .*{message}") as raised:
+                import_module(f"gift_peft.{VERBS[command[0]][0]}").run([*command[1:], str(path)])
+            assert str(path) in str(raised.value)
+        assert mine.read_text() == "mine" and list(tmp_path.iterdir()) == [mine]
+    assert targets_page.MARK in targets_page.PAGE
+    for _ in range(2):  # a card of ours is written again
+        import_module("gift_peft.reports.report_verb").run([*card[1:], str(tmp_path / "card.md")])
+    assert model_card.MARK in (tmp_path / "card.md").read_text()
+
+
 def test_an_output_never_is_an_input(tmp_path):
     photos = tmp_path / "photos"
     write(photos, "Kitchen.PNG", "caf\u00e9.png")
@@ -116,6 +141,16 @@ def test_an_output_never_is_an_input(tmp_path):
     with pytest.raises(ValueError, match="would replace the input"):  # an input that is a link: the link stays too
         check_inputs_stay([tmp_path / "ALIAS.png"], [tmp_path / "alias.png"])
     check_inputs_stay([photos / "kitchen.npy", tmp_path / "Photos/Kitchen.PNG", tmp_path / "new/kitchen.png"], inputs)
+
+
+def test_weights_that_were_not_fetched(tmp_path):
+    (tmp_path / "model.safetensors").write_text(
+        "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 9\n"
+    )
+    shutil.copy(ROOT / "src/gift_peft/demo/base/config.json", tmp_path)
+    with pytest.raises(ValueError, match=r"base model .*: of model\.safetensors only Git LFS's pointer is there"):
+        load_base(tmp_path)
+    assert unfetched(ROOT / "src/gift_peft/demo/base") is None and unfetched("somebody/on-the-hub") is None
 
 
 def test_a_folder_is_never_seen_half_deleted(tmp_path, monkeypatch):

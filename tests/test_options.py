@@ -43,7 +43,7 @@ def options(parser):
 
 def parsed(parser, option, action):
     """What the option makes of a right value: {dest: value}, without the defaults of others."""
-    count = {"+": 1, "?": 0, None: 1}.get(action.nargs, action.nargs)
+    count = {"+": 1, "*": 1, "?": 0, None: 1}.get(action.nargs, action.nargs)
     word = action.choices[0] if action.choices else "2"
     for other in parser._actions:
         other.required, other.default = False, argparse.SUPPRESS

@@ -142,6 +142,16 @@ def remove_files(root: Path, names: Iterable[str]) -> None:
                 break  # it holds something else, or is gone
 
 
+def check_own_file(path: Path, mark: str, option: str) -> None:
+    """Raise ValueError if the file that an option names is there and is not ours: it does not hold `mark`, a line that
+    all of its kind have. IsADirectoryError for a folder.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f"{option} {path} is a folder: name a file in it")
+    if os.path.lexists(path) and not (path.is_file() and mark.encode() in path.read_bytes()):
+        raise ValueError(f"{option} {path} was not written by this command and is kept: name another file")
+
+
 def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     """Raise ValueError if a file to be written is one that is read: the same one, also through links, or one whose
     name differs in case or in the composition of accents alone, which is the same on many disks."""
@@ -171,7 +181,27 @@ def is_leftover(name: str) -> bool:
     """Whether a file or folder of this name is passed over wherever a person's files are listed: hidden ones
     (`.DS_Store`, `._photo.jpg`, `.AppleDouble`), and those of `LEFTOVERS`.
     """
-    return name.startswith(".") or name.casefold() in LEFTOVERS
+    return (name.startswith(".") and not is_in_the_cloud(name)) or name.casefold() in LEFTOVERS
+
+
+def is_in_the_cloud(name: str) -> bool:
+    """Whether a file stands for one that is still in iCloud: `.photo.jpg.icloud` for photo.jpg."""
+    return name.startswith(".") and name.endswith(".icloud")
+
+
+def is_lfs_pointer(start: bytes) -> bool:
+    """Whether a file begins as what Git LFS keeps in place of a file that was not fetched."""
+    return start.startswith(b"version https://git-lfs")
+
+
+def unfetched(folder: str | Path) -> str | None:
+    """What to say of a folder of weights of which only Git LFS's pointers are there; None if they are all there."""
+    for path in sorted(Path(folder).glob("*")) if Path(folder).is_dir() else ():
+        if path.suffix in (".safetensors", ".bin") and path.is_file():
+            with open(path, "rb") as file:
+                if is_lfs_pointer(file.read(32)):
+                    return f"of {path.name} only Git LFS's pointer is there: `git lfs pull` fetches it"
+    return None
 
 
 # ---- small files ----

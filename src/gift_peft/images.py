@@ -5,21 +5,24 @@ so in one line that names the file.
 """
 
 import base64
+import glob
 import hashlib
 import io
 import logging
+import os
 import re
 import struct
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageOps
 
-from gift_peft.files import is_leftover, reason
+from gift_peft.files import is_in_the_cloud, is_leftover, is_lfs_pointer, reason
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +74,10 @@ def name_skipped(names: Sequence[str]) -> str:
     """How messages tell of files that are not read: their number, their names, and what helps."""
     heif = any(Path(name).suffix.lower() in HEIF_SUFFIXES for name in names)
     count = f"{len(names)} file{'s are' if len(names) != 1 else ' is'} not read"
-    return f"{count}: {', '.join(names)}" + (f" ({HEIF_HINT})" if heif else "")
+    hints = [HEIF_HINT] if heif else []
+    if any(is_in_the_cloud(Path(name).name) for name in names):
+        hints.append("download what is still in iCloud")
+    return f"{count}: {', '.join(names)}" + (f" ({'; '.join(hints)})" if hints else "")
 
 
 def open_image(source: str | Path | bytes | Image.Image, name: str | None = None) -> Image.Image:
@@ -82,6 +88,7 @@ def open_image(source: str | Path | bytes | Image.Image, name: str | None = None
     name = name or str(source)
     try:
         image = source if isinstance(source, Image.Image) else _opened(source)
+        pages = _pages(image)
         # Pillow reduces 16-bit RGB to 8 bits while decoding; only the tiles of a file not yet decoded tell.
         deep = any(";16" in str(tile[-1]) for tile in getattr(image, "tile", ()))
         image.load()
@@ -94,8 +101,15 @@ def open_image(source: str | Path | bytes | Image.Image, name: str | None = None
         why = "; the link leads nowhere: fetch its content (git annex get, dvc pull, hf download)" if dangling else ""
         raise FileNotFoundError(f"{name}: no such file{why}") from None
     except (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError) as error:
-        hint = f"; it is HEIC: {HEIF_HINT}" if _is_heif(source) and not reads_heif() else f" ({reason(error)})"
+        if _is_heif(source) and not reads_heif():
+            hint = f"; it is HEIC: {HEIF_HINT}"
+        elif is_lfs_pointer(_start(source)):
+            hint = "; only Git LFS's pointer to it is there: `git lfs pull` fetches the file"
+        else:
+            hint = f" ({reason(error)})"
         raise ValueError(f"{name}: not a readable image, or truncated{hint}") from None
+    if pages > 1:
+        raise ValueError(f"{name}: it holds {pages} pictures; save each as a file of its own")
     if deep and image.mode not in SINGLE_CHANNEL:
         raise ValueError(f"{name}: a 16-bit image; save it with 8 bits per channel")
     return image
@@ -112,18 +126,34 @@ def _opened(source: str | Path | bytes) -> Image.Image:
 
 def _is_heif(source: str | Path | bytes | Image.Image) -> bool:
     """By the content: phones also call such files .jpg."""
-    if isinstance(source, Image.Image):
-        return False
-    try:
-        start = source[:12] if isinstance(source, bytes) else _first_bytes(source)
-    except OSError:
-        return False
+    start = _start(source)
     return start[4:8] == b"ftyp" and start[8:12] in HEIF_BRANDS
 
 
-def _first_bytes(path: str | Path) -> bytes:
-    with open(path, "rb") as file:
-        return file.read(12)
+def _start(source: str | Path | bytes | Image.Image) -> bytes:
+    """The first bytes of a file, none of what is no file or cannot be read."""
+    if isinstance(source, Image.Image | bytes):
+        return source[:32] if isinstance(source, bytes) else b""
+    try:
+        with open(source, "rb") as file:
+            return file.read(32)
+    except OSError:
+        return b""
+
+
+def _pages(image: Image.Image) -> int:
+    """How many pictures of its size a file of a kind for several holds. MPO, AVIF and HEIC say which one is the photo;
+    TIFF also keeps small previews.
+    """
+    pages = getattr(image, "n_frames", 1) if image.format in ("TIFF", "GIF", "PNG", "WEBP") else 1
+    if pages == 1 or image.format != "TIFF":
+        return pages
+    size, count = image.size, 0
+    for page in range(pages):
+        image.seek(page)
+        count += image.size == size
+    image.seek(0)
+    return count
 
 
 def hidden_turn(path: Path) -> int | None:
@@ -184,7 +214,13 @@ def to_mask(image: Image.Image, name: str, target_class: int | Sequence[int] | N
     """
     if image.mode == "P" and target_class is not None:
         return _palette_class(image, name, np.atleast_1d(target_class))
-    values = np.asarray(image) if image.mode in SINGLE_CHANNEL and image.mode != "P" else _grey(image, name)
+    if image.mode == "F":  # what NumPy users save: 0.0 and 1.0, or 0.0 and 255.0
+        values = np.asarray(image)
+        if not (values == np.round(values).clip(0, 65535)).all():  # NaN as well
+            raise ValueError(f"{name}: its values are fractions, negative or not finite; save it as black and white")
+        values = values.astype(np.int64)
+    else:
+        values = np.asarray(image) if image.mode in SINGLE_CHANNEL and image.mode != "P" else _grey(image, name)
     if values.dtype == bool:
         return values if target_class is None else np.isin(values * 255, target_class) | np.isin(values, target_class)
     levels = (
@@ -276,6 +312,13 @@ def sort_pictures(paths: Iterable[Path]) -> list[Path]:
     return sorted(filter(is_image_file, paths), key=lambda path: natural_key(path.name))
 
 
+def _matching(path: str | Path) -> list[Path]:
+    """The files of a pattern like `photos/*.jpg`, which shells of Windows leave to the program; else the path."""
+    if glob.has_magic(str(path)) and not os.path.lexists(path):
+        return [Path(name) for name in sorted(glob.glob(str(path)))] or [Path(path)]
+    return [Path(path)]
+
+
 def list_images(images: Sequence[str | Path]) -> list[Path]:
     """Picture files, and those of the folders named; FileNotFoundError or ValueError where there are none.
 
@@ -283,7 +326,7 @@ def list_images(images: Sequence[str | Path]) -> list[Path]:
     """
     files: list[Path] = []
     skipped: list[Path] = []
-    for path in map(Path, images):
+    for path in chain.from_iterable(map(_matching, images)):
         if path.is_dir():
             if path.name in (".", "..") or not is_leftover(path.name) or len(images) == 1:
                 inside = [entry for entry in path.iterdir() if not entry.is_dir()]

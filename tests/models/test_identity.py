@@ -45,7 +45,6 @@ SAME = {
         (folder / "config.json").read_bytes().replace(b"\n", b"\r\n")
     ),
     "an extra bin": as_pickle,
-    "only the bin": lambda folder: (as_pickle(folder), (folder / "model.safetensors").unlink()),
     "saved again": resave,
     "sharded": lambda folder: resave(folder, max_shard_size="40KB"),
     "a reordered config": lambda folder: edit(folder / "config.json", lambda c: dict(sorted(c.items(), reverse=True))),

@@ -1,6 +1,7 @@
 """Where a report writes and what it leaves alone; where it finds a run's data again."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -30,6 +31,14 @@ def evaluated(base_dir, tree, tmp_path_factory):
 @pytest.fixture
 def run_folder(evaluated, tmp_path):
     return Path(shutil.copytree(evaluated, tmp_path / "my-run"))
+
+
+def test_two_evaluations_of_a_run_are_told_apart(run_folder, tmp_path):
+    shutil.copytree(run_folder / "evaluation", run_folder / "later")
+    run_report([run_folder], tmp_path / "report", panels=0)
+    text = (tmp_path / "report/report.md").read_text()
+    for place in ("evaluation", "later"):
+        assert re.search(rf"^\| .* \({place}\) \+ GIFT \|", text, re.MULTILINE), text
 
 
 def test_a_report_keeps_what_no_report_wrote(run_folder, tmp_path):

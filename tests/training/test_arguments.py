@@ -48,6 +48,23 @@ def test_yamls_bare_no_is_the_word(tmp_path):
     assert (args.mixed_precision, args.push_to_hub) == ("no", False)
 
 
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [("true", "latest"), ("True", "latest"), ("false", None), ("null", None), ("run/checkpoint-3",) * 2],
+)
+def test_resuming_as_transformers_has_it(tmp_path, text, word):
+    path = tmp_path / "a.yaml"
+    path.write_text(f"resume_from_checkpoint: {text}\nnum_train_epochs: 3.0\nlearning_rate: 2e-5\n")
+    given = ["--model_name_or_path=a", "--dataset_name=b", "--output_dir=c"]
+    args = parse_arguments([*given, "--config", str(path)])
+    assert (args.resume_from_checkpoint, args.num_train_epochs, args.learning_rate) == (word, 3, 2e-5)
+    if text != "null":
+        assert parse_arguments([*given, "--resume_from_checkpoint", text]).resume_from_checkpoint == word
+    path.write_text("num_train_epochs: 2.5\n")
+    with pytest.raises(ValueError, match="num-train-epochs: invalid int value"):
+        parse_arguments([*given, "--config", str(path)])
+
+
 def test_base_dataset_and_out_are_second_names():
     args = parse_arguments(["--base=m", "--dataset", "d_d", "--out", "o", "--lora-rank", "3", "--push_to_hub"])
     expected = {"model_name_or_path": "m", "dataset_name": "d_d", "output_dir": "o", "lora_rank": 3}

@@ -53,7 +53,7 @@ class CocoImage:
 def coco_images(content: dict) -> dict[str, CocoImage]:
     """What a COCO file says of each image, by its relative name.
 
-    Raises ValueError for references to nothing, missing labels, and absolute names or ones with `..`.
+    Raises ValueError for references to nothing, missing labels, and the panoptic form.
     """
     categories: dict[str, set] = {}
     listed = set()
@@ -76,6 +76,8 @@ def coco_images(content: dict) -> dict[str, CocoImage]:
         images[name] = CocoImage((image.get("width"), image.get("height")), [], categories, used)
         names[number] = name
     for annotation in dicts(content["annotations"], "annotations"):
+        if "segments_info" in annotation:
+            raise ValueError("COCO's panoptic form is not read; export instances (polygons or run lengths)")
         image_id, category_id = _id(annotation.get("image_id")), _id(annotation.get("category_id"))
         if image_id not in names:
             raise ValueError(f"an annotation for image id {image_id!r}, which is not listed")

@@ -37,6 +37,6 @@ def read_colors(image: Image.Image, path: Path, labelmap: Path, mask_class: Mask
     unknown = np.setdiff1d(np.unique(values), list(codes.values()))
     if len(unknown):
         raise ValueError(f"{path}: {len(unknown)} colours that {labelmap} does not name")
-    labels = {label: (index,) for index, label in enumerate(codes) if label != "background"}
+    labels = {label: (index,) for index, label in enumerate(codes) if label.casefold() != "background"}
     chosen = choose_labels(labels, mask_class, f"labels of {labelmap}")
     return np.isin(values, [codes[label] for label in chosen])

@@ -14,11 +14,14 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from gift_peft.captures.coco import CocoImage, coco_images
-from gift_peft.captures.folders import EXPORTS, Listing, holds_no_photos, same_name
+from gift_peft.captures.folders import EXPORTS, Listing, holds_no_photos, same_name, uploaded_names
 from gift_peft.captures.label_studio import LabelStudioImage, label_studio_images
+from gift_peft.files import is_lfs_pointer
 from gift_peft.images import is_image_file
 
-UPLOAD_PREFIX = re.compile(r"^[0-9a-f]{8}-")  # Label Studio puts it before the names of uploaded files
+# Label Studio puts eight digits before the names of uploaded files; Roboflow makes photo_png.rf.<digest>.jpg of them.
+UPLOAD_PREFIX = re.compile(r"^[0-9a-f]{8}-")
+ROBOFLOW = re.compile(r"_([A-Za-z0-9]{2,5})\.rf\.[0-9A-Za-z]+\.[a-z]+$")
 TOOLS = {"coco": "COCO", "label-studio": "Label Studio"}
 
 
@@ -63,7 +66,10 @@ def _parsed(path: Path, modified: int, length: int) -> tuple[str, dict]:
 def load_json(path: Path) -> Any:
     """A JSON file's content, with a byte order mark or without; ValueError naming the file."""
     try:
-        return json.loads(path.read_bytes())
+        content = path.read_bytes()
+        if is_lfs_pointer(content):
+            raise OSError(0, "only Git LFS's pointer to it is there: `git lfs pull` fetches the file")
+        return json.loads(content)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError):  # malformed, or not UTF-8
@@ -78,12 +84,15 @@ def find_entry(
     ValueError where two names, or one name and two photos of the group, fit.
     """
     inside = base == group_dir
-    needed = _parts(photo.relative_to(group_dir if inside else group_dir.parent).as_posix())
-    for form in (_parts, _stripped, _loose):
-        if form is _loose:  # the export of photos that were converted, or renamed by a system without capitals
-            if sum(is_image_file(path) for path in listing.called(photo.parent, same_name(photo.stem))) > 1:
-                break
-            needed = _loose("/".join(needed))
+    whole = _parts(photo.relative_to(group_dir if inside else group_dir.parent).as_posix())
+    forms = [(_parts, whole), (_stripped, whole)]
+    # The export of photos that were converted, or renamed by a system without capitals.
+    if sum(is_image_file(path) for path in listing.called(photo.parent, same_name(photo.stem))) <= 1:
+        forms.append((_loose, _loose("/".join(whole))))
+    for renamed in uploaded_names(photo.name):
+        if listing.uploaded(photo.parent)[renamed] == 1:
+            forms.append((_loose, _loose("/".join((*whole[:-1], renamed)))))
+    for form, needed in forms:
         matches, short = [], False
         for name in names:
             parts = form(name)
@@ -97,8 +106,14 @@ def find_entry(
             if short and namesakes(photo, group_dir):
                 raise ValueError(f"{export}: {found} may mean several images called {photo.name}; rename them")
             return found
-    matches = [] if inside else _bare(names, photo)
-    return _only(matches, photo, export) if matches and listing.photo_names(base)[same_name(photo.name)] == 1 else None
+    if inside:
+        return None
+    called = same_name(photo.name)
+    matches = _bare(names, called) if listing.photo_names(base)[called] == 1 else []
+    for renamed in uploaded_names(photo.name):
+        if not matches and listing.uploaded(base, deep=True)[renamed] == 1:
+            matches = _bare(names, renamed)
+    return _only(matches, photo, export) if matches else None
 
 
 def describe_export(path: Path, photo: Path, base: Path, group_dir: Path, listing: Listing) -> str | None:
@@ -107,7 +122,7 @@ def describe_export(path: Path, photo: Path, base: Path, group_dir: Path, listin
     if kind not in TOOLS:
         return None
     count = listing.photo_names(base)[same_name(photo.name)]
-    if base != group_dir and count > 1 and _bare(list(images), photo):
+    if base != group_dir and count > 1 and _bare(list(images), same_name(photo.name)):
         below = photo.relative_to(group_dir.parent).as_posix()
         return (
             f"{path} ({TOOLS[kind]}) lists {photo.name}, a name that {count} photos below {base} have; call it {below}"
@@ -129,9 +144,9 @@ def namesakes(photo: Path, group_dir: Path) -> bool:
     return False
 
 
-def _bare(names: Sequence[str], photo: Path) -> list[str]:
-    """The names without a folder that are this photo's."""
-    return [name for name in names if same_name(photo.name) in ("/".join(_parts(name)), "/".join(_stripped(name)))]
+def _bare(names: Sequence[str], called: str) -> list[str]:
+    """The names without a folder that are this one."""
+    return [name for name in names if called in ("/".join(_parts(name)), "/".join(_stripped(name)))]
 
 
 def _only(matches: list[str], photo: Path, export: Path) -> str:
@@ -151,5 +166,6 @@ def _loose(name: str) -> tuple[str, ...]:
 
 
 def _stripped(name: str) -> tuple[str, ...]:
+    """Without what Label Studio and Roboflow add to names."""
     *folders, last = _parts(name)
-    return (*folders, UPLOAD_PREFIX.sub("", last))
+    return (*folders, ROBOFLOW.sub(r".\1", UPLOAD_PREFIX.sub("", last)))

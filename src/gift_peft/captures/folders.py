@@ -4,6 +4,7 @@ Names are compared as people see them: accents composed or not, and where nothin
 """
 
 import os
+import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterator
@@ -24,6 +25,17 @@ def same_name(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
+def uploaded_names(name: str) -> tuple[str, ...]:
+    """What a labeling server makes of a name that browsers and phones give, `photo 1 (2).jpg`; () if it keeps it.
+
+    Label Studio writes spaces as underscores and leaves out what is no letter, digit, `-`, `_` or `.` (Django's rule);
+    Roboflow writes spaces as hyphens.
+    """
+    name = same_name(name)
+    made = re.sub(r"[^-\w.]", "", name.strip().replace(" ", "_")), name.replace(" ", "-")
+    return tuple(other for other in dict.fromkeys(made) if other != name)
+
+
 def holds_no_photos(folder: str) -> bool:
     """Whether a folder of this name is passed over where photos are listed."""
     name = folder.casefold()
@@ -38,6 +50,7 @@ class Listing:
         self._stems: dict[Path, dict[str, list[Path]]] = {}
         self._photos: dict[Path, set[str]] = {}
         self._names: dict[Path, Counter] = {}
+        self._uploaded: dict[tuple[Path, bool], Counter] = {}
 
     def entries(self, folder: Path) -> list[Path]:
         """Sorted, without leftovers; [] where there is no such folder."""
@@ -71,6 +84,20 @@ class Listing:
         if folder not in self._names:
             self._names[folder] = _counted(folder, _stamp(folder))
         return self._names[folder]
+
+    def uploaded(self, folder: Path, deep: bool = False) -> Counter:
+        """How many pictures in a folder (and below it) have each name once it was uploaded; their own names count."""
+        if (folder, deep) not in self._uploaded:
+            own = self.photo_names(folder) if deep else Counter(self._picture_names(folder))
+            made: Counter = Counter()
+            for name, count in own.items():
+                for called in (name, *uploaded_names(name)):
+                    made[called] += count
+            self._uploaded[folder, deep] = made
+        return self._uploaded[folder, deep]
+
+    def _picture_names(self, folder: Path) -> list[str]:
+        return [same_name(path.name) for path in self.entries(folder) if is_image_file(path)]
 
 
 def files_below(folder: Path) -> Iterator[Path]:

@@ -22,11 +22,15 @@ def read_facts(folder: Path) -> dict:
     facts = read_yaml(path)
     if not facts.keys() <= GROUP_KEYS:
         raise ValueError(f"{path}: it may have the keys {', '.join(sorted(GROUP_KEYS))} and no others")
+    if facts.get("surface") is not None:
+        facts["surface"] = str(facts["surface"]).lower()
     if facts.get("surface") not in (None, *SURFACES):
         raise ValueError(f"{path}: surface {facts['surface']!r}; it is one of {', '.join(SURFACES)}")
     classes = facts.get("mask_class", [])
-    if not all(isinstance(value, int | str) for value in (classes if isinstance(classes, list) else [classes])):
-        raise ValueError(f"{path}: mask_class {classes!r}; it is the target's value or label in the masks, or a list")
+    for value in classes if isinstance(classes, list) else [classes]:
+        if isinstance(value, bool) or not isinstance(value, int | str):
+            what = "the target's value or label in the masks, or a list; yes, no, on and off need quotes"
+            raise ValueError(f"{path}: mask_class {classes!r}; it is {what}")
     if facts.get("empty_masks", "refuse") not in EMPTY_MASKS:
         raise ValueError(f"{path}: empty_masks {facts['empty_masks']!r}; it is one of {', '.join(EMPTY_MASKS)}")
     if not isinstance(facts.get("static_rig", False), bool):

@@ -50,10 +50,12 @@ class LabelStudioImage:
 def label_studio_images(content: list) -> dict[str, LabelStudioImage]:
     """What Label Studio's own JSON says of each image, by its name.
 
-    Raises ValueError for two annotations of one image, missing labels, and names with `..`.
+    Raises ValueError for two annotations of one image, missing labels, and a file of nothing but predictions.
     """
     images: dict[str, LabelStudioImage] = {}
     labels: dict[str, tuple] = {}
+    if any(map(_is_predicted, content)) and not any(task.get("annotations") for task in content):
+        raise ValueError("it holds predictions only, which nobody has submitted as annotations in Label Studio")
     for task in content:
         name = _task_image(task)
         if name in images:
@@ -100,6 +102,12 @@ def label_studio_mask(result: dict, size: tuple[int, int]) -> np.ndarray:
         return polygon_mask(rectangle_points(value["x"] * across, value["y"] * down, *sides, turn), size)
     except (KeyError, IndexError, TypeError):
         raise NoArea(f"a region of type {result.get('type')!r} has no area; use brush or polygon") from None
+
+
+def _is_predicted(task: dict) -> bool:
+    """Whether a model drew something; newer exports only name the prediction by its number."""
+    given = task.get("predictions")
+    return isinstance(given, list) and any(not isinstance(one, dict) or one.get("result") for one in given)
 
 
 def _task_image(task: dict) -> str:

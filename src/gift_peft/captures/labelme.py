@@ -25,7 +25,7 @@ def read_labelme(content: dict, size: tuple[int, int], mask_class: MaskClass) ->
     check_size("its shapes are for", (content.get("imageWidth"), content.get("imageHeight")), size)
     shapes = dicts(content["shapes"], "shapes")
     labels = [checked_label(shape.get("label")) for shape in shapes]
-    known = {label: () for label in labels if mask_class is not None or label not in NEVER_A_TARGET}
+    known = {label: () for label in labels if mask_class is not None or label.casefold() not in NEVER_A_TARGET}
     chosen = choose_labels(known, mask_class, "labels") if known else []
     mask, lacking, found = np.zeros(size[::-1], bool), None, False
     for label, shape in zip(labels, shapes, strict=True):

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from gift_peft.images import is_image_file
@@ -30,9 +30,19 @@ def choose_labels(known: Mapping[str, Collection], mask_class: MaskClass, what: 
             )
         return list(known)
     chosen = [label for label, numbers in known.items() if label in names or not set(numbers).isdisjoint(values)]
+    for name in names:
+        if name not in known:  # written in other capitals, if that can mean one label only
+            alike = [label for label in known if _plain(label) == _plain(name)]
+            if len(alike) > 1:
+                raise ValueError(f"mask_class {name!r} may mean {' or '.join(map(repr, alike))}; write it as there")
+            chosen += [label for label in alike if label not in chosen]
     if not chosen:
         raise ValueError(f"mask_class {mask_class!r} is none of the {what} there ({', '.join(known)})")
     return chosen
+
+
+def _plain(label: str) -> str:
+    return label.strip().casefold()
 
 
 def check_size(name: str, size: tuple, expected: tuple[int, int]) -> None:
@@ -47,13 +57,16 @@ def check_size(name: str, size: tuple, expected: tuple[int, int]) -> None:
 
 
 def relative_name(name: Any) -> str:
-    """An export's image name with forward slashes; ValueError for absolute ones and those that climb out."""
-    if not isinstance(name, str) or not name.strip("/\\. "):
+    """An export's image name with forward slashes: of a path of another machine, or one that climbs with `..`, what is
+    below that. It is compared with the names of photos, and nothing is opened by it. ValueError for no name.
+    """
+    if not isinstance(name, str) or not name.strip("/\\. ") or "\0" in name:
         raise ValueError(f"{name!r} is not an image's name")
-    path = name.replace("\\", "/")
-    if path.startswith(("/", "~")) or re.match(r"[A-Za-z]:", path) or ".." in path.split("/") or "\0" in path:
-        raise ValueError(f"{name!r} is an absolute path or climbs with `..`; name images relative to the group")
-    return str(PurePosixPath(path))
+    path = re.sub(r"^[A-Za-z]:", "", name.replace("\\", "/"))
+    parts = [part for part in re.split(r"(?:^|.*/)\.\.(?=/|$)", path)[-1].split("/") if part not in ("", ".")]
+    if not parts:
+        raise ValueError(f"{name!r} is not an image's name")
+    return "/".join(parts)
 
 
 def without_query(name: str) -> str:

@@ -25,6 +25,11 @@ from gift_peft.images import SINGLE_CHANNEL, SUFFIXES, is_image_file, open_image
 
 MASK_SUFFIXES = SUFFIXES | {".gif"}
 GROUP_MASK = "mask"  # `mask.*` beside the photos holds for all of them
+MARK = re.compile(r"[-_. ]mask$", re.IGNORECASE)  # photo_mask.png beside photo.jpg, and the like
+ENDINGS = ("_mask", "-mask", ".mask", " mask")
+# Files of masks that are not read, and folders that people keep them in: named where a mask is missing.
+UNREAD = {".npy", ".npz", ".mat", ".svg", ".psd", ".xcf", ".kra", ".txt", ".csv", ".jsonl", ".ndjson", ".icloud"}
+MORE_FOLDERS = (*EXPORTS, "labels", "label", "ann", "jsons")
 HIDES_EXIF = ("labelme", "coco", "cvat")  # forms whose tools do not all go by a photo's EXIF rotation
 
 
@@ -90,7 +95,7 @@ def is_mask_file(path: Path, group_dir: Path) -> bool:
     folders = path.relative_to(group_dir).parent.parts
     if any(map(holds_no_photos, folders)) or _is_label_studio_picture(path) or is_group_mask(path):
         return True
-    stem = re.sub("_mask$", "", same_name(path.stem), flags=re.IGNORECASE)
+    stem = MARK.sub("", same_name(path.stem))
     return stem != same_name(path.stem) and any(
         same_name(other.stem) == stem and is_image_file(other) for other in path.parent.iterdir() if other != path
     )
@@ -124,8 +129,8 @@ def find_mask(
 
     Several images of a group share one `listing`.
 
-    Raises ValueError naming the file for a damaged export, an ambiguous one, one that names files by absolute paths
-    or with `..`, and for a mask whose links lead nowhere, or out of `root` and not where the photo's lead.
+    Raises ValueError naming the file for a damaged export, an ambiguous one, and for a mask whose links lead nowhere,
+    or out of `root` and not where the photo's lead.
     """
     bases, listing = _bases(group_dir, root), listing or Listing()
     for path in _own_files(image_path, group_dir, bases, listing):
@@ -180,7 +185,37 @@ def explain_missing(image_path: Path, group_dir: Path, root: Path) -> str:
             parts += [f"{path} is not read (export as COCO, or as masks)" for path in xml]
         seen = list_exports(base, listing)
         parts += filter(None, (describe_export(path, image_path, base, group_dir, listing) for path in seen))
+    if unread := _unread(image_path, group_dir, root, listing):
+        more = f" and {len(unread) - 2} more" if len(unread) > 2 else ""
+        forms = "masks are pictures, or files of labelme, CVAT, COCO or Label Studio"
+        parts.append(f"not read: {', '.join(unread[:2])}{more} ({forms})")
+    for folder in filter(Path.is_dir, listing.entries(group_dir)):
+        if not holds_no_photos(folder.name) and same_name(image_path.stem) in listing.photo_stems(folder):
+            parts.append(f"if {folder.name}/ holds masks and not photos, call it masks/")
     return "; ".join([*parts, "`gift-peft prepare RAW OUT --propose-masks` draws first ones"])
+
+
+def _unread(image_path: Path, group_dir: Path, root: Path, listing: Listing) -> list[str]:
+    """Files that may hold masks in a form that is not read, by their places in the tree."""
+    within = [image_path.parent, *_bases(group_dir, root)]
+    folders = [path for folder in within for path in (folder, *listing.subfolders(folder, MORE_FOLDERS))]
+    found = []
+    for folder in dict.fromkeys(folders):
+        below = folder.is_relative_to(group_dir)  # above the group, text files are notes and lists
+        for path in listing.entries(folder):
+            kind = path.suffix.lower()
+            if _is_strange_json(path, root, image_path) if kind == ".json" else kind in UNREAD and below:
+                found.append(path.relative_to(root).as_posix())
+    return found
+
+
+def _is_strange_json(path: Path, root: Path, photo: Path) -> bool:
+    """Whether a JSON is about this photo, in a form of no tool that is known here."""
+    try:
+        known = _is_labelme(load_json(checked(path, root, photo))) or read_export(path)[0] != "other"
+        return not known and (path.stem in (photo.stem, photo.name) or photo.name.encode() in path.read_bytes())
+    except (OSError, ValueError):
+        return False
 
 
 def _bases(group_dir: Path, root: Path) -> list[Path]:
@@ -203,7 +238,10 @@ def _own_files(image_path: Path, group_dir: Path, bases: Sequence[Path], listing
     for folder in folders:
         yield from _called(listing, folder, image_path, MASK_SUFFIXES)
     for folder in (*folders, image_path.parent):
-        yield from _called(listing, folder, image_path, MASK_SUFFIXES, "_mask")
+        found = [path for end in ENDINGS for path in _called(listing, folder, image_path, MASK_SUFFIXES, end)]
+        if len(found) > 1:
+            raise ValueError(f"{found[0]} and {found[1].name} may both be the mask of {image_path.name}; keep one")
+        yield from found
     for folder in (image_path.parent, *folders, *listing.subfolders(group_dir, EXPORTS)):
         yield from _called(listing, folder, image_path, {".json"})
     for base in bases:  # CVAT keeps the images' folders below its own, as they were uploaded

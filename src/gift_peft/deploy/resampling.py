@@ -53,7 +53,9 @@ def resample(
         factor = None if factors is None or sizes is not None else factors[axis]
         count = sizes[axis] if sizes is not None else torch.sym_int(length * factors[axis])
         factor = None if recompute_scale_factor else factor
-        step = _step(length, count, factor, bool(align_corners), input)
+        # torch takes positions of nearest in float32 whatever the values are; at ties that says which pixel.
+        like = input.new_zeros((), dtype=torch.float32) if mode == "nearest" else input
+        step = _step(length, count, factor, bool(align_corners), like)
         if mode == "nearest":
             places = torch.arange(count, device=input.device).to(step.dtype) * step
             input = input.index_select(dimension, places.floor().to(torch.int64).clamp(max=length - 1))

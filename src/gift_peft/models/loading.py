@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 from torch import nn
 
-from gift_peft.files import reason
+from gift_peft.files import reason, unfetched
 from gift_peft.images import given_picture
 from gift_peft.models.adapter_base import check_base, find_base
 from gift_peft.models.full_precision import without_tf32
@@ -348,7 +348,7 @@ def load_base(base: str | Path, revision: str | None = None, with_processor: boo
             raise ValueError(f"base model {base}: it has pickled weights only (.bin); take safetensors") from None
         raise FileNotFoundError(f"base model {base}: {reason(error)}") from error
     except (ValueError, RuntimeError, SafetensorError) as error:  # of another shape, cut off, no tensors
-        raise ValueError(f"base model {base}: {reason(error)}") from error
+        raise ValueError(f"base model {base}: {unfetched(base) or reason(error)}") from error
     if getattr(model, "peft_config", None):  # transformers loads the base of an adapter by itself
         raise adapter_as_base(base)
     return model.eval(), processor
@@ -386,7 +386,8 @@ def _attach(model, processor, base, adapter, revision, accept_base):
         except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, UserWarning, re.error) as error:
             raise ValueError(f"{mismatch} ({reason(error)})") from None
         except (OSError, SafetensorError) as error:
-            raise ValueError(f"adapter {adapter}: damaged {ADAPTER_WEIGHTS} ({reason(error)})") from None
+            why = unfetched(adapter) or f"damaged {ADAPTER_WEIGHTS} ({reason(error)})"
+            raise ValueError(f"adapter {adapter}: {why}") from None
     try:
         processor = load_processor(adapter)
     except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:

@@ -28,6 +28,7 @@ from gift_peft.evaluation.tables import (
 from gift_peft.files import is_hub_id, portable_name
 
 HERE = Path(__file__).parent
+MARK = "# GIFT adapter for "  # of the template, by which a card of ours is known
 TAGS = ["gift", "lora", "depth-estimation", "transparent-objects", "mirrors"]
 # As the models' pages state them: of Depth Anything V2 only the small one may be used commercially.
 LICENSES = {

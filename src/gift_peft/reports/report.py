@@ -15,7 +15,7 @@ from gift_peft.evaluation.ordering_tables import TITLES, ordering_tables
 from gift_peft.evaluation.results import Report
 from gift_peft.evaluation.table_formats import Table, to_csv, to_latex, to_markdown, to_text
 from gift_peft.evaluation.tables import comparison_table, group_table, protocol_note, uncertainty_table
-from gift_peft.files import check_inputs_stay, reason, write_whole
+from gift_peft.files import check_inputs_stay, check_own_file, reason, write_whole
 from gift_peft.images import list_images
 from gift_peft.reports.ablation import ablation_table, is_ablation
 from gift_peft.reports.chosen import chosen_panels, notable_observations
@@ -23,7 +23,7 @@ from gift_peft.reports.compare import write_compare
 from gift_peft.reports.curves import draw_dynamics, draw_retention
 from gift_peft.reports.dial_curve import draw_dial
 from gift_peft.reports.figures import Panel, before_after, error_maps
-from gift_peft.reports.model_card import model_card
+from gift_peft.reports.model_card import MARK, model_card
 from gift_peft.reports.saved_run import SavedRun, folder_names, read_run, run_names
 from gift_peft.reports.zero_shot import checkpoint_folders, draw_zero_shot
 
@@ -107,10 +107,12 @@ def run_report(
     planned = [run for run in saved if run.path.is_file()]
     if planned and not card:
         raise ValueError(f"{planned[0].path}: not a run yet; --model-card FILE writes the card of what it will be")
-    if planned:
-        path = Path("model_card.md") if card is True else Path(card)
-        check_inputs_stay([path], [saved[0].path])
-        return _write_card(saved[0], path)
+    if card and (planned or card is not True):
+        path = Path("model_card.md" if card is True else card)
+        check_inputs_stay([path], [run.path for run in planned])
+        check_own_file(path, MARK, "--model-card")
+        if planned:
+            return _write_card(saved[0], path)
     if zero_shot:  # fail early on a missing picture or checkpoint
         list_images(zero_shot)
         for run in saved:
@@ -198,9 +200,11 @@ def _tables(runs: Sequence[SavedRun], names: Sequence[str], output: Output) -> N
     """One comparison per dataset and protocol, with intervals and groups of every report behind it."""
     together: dict[tuple, list[tuple[str, str, Report]]] = {}
     for run, name, own in zip(runs, names, folder_names(runs), strict=True):
-        for report in run.evaluations.values():
-            key = (_dataset(report), report.unit, protocol_note(report))
-            together.setdefault(key, []).append((_scaled(name, report), own, report))
+        kinds = {place: (_dataset(one), one.unit, protocol_note(one)) for place, one in run.evaluations.items()}
+        for place, report in run.evaluations.items():
+            again = list(kinds.values()).count(kinds[place]) > 1  # evaluated twice this way: the folder tells which
+            called = _scaled(f"{name} ({place})" if again else name, report)
+            together.setdefault(kinds[place], []).append((called, own, report))
     used: dict[str, int] = {}
     for (dataset, *_), entries in together.items():
         used[dataset] = used.get(dataset, 0) + 1

@@ -21,6 +21,7 @@ from gift_peft.rules import GroupPictures
 WIDTH = 320  # of a picture
 LIMIT = 400  # observations: a page of more is slow to open
 
+MARK = "<title>Surface targets</title>"  # by which a page of ours is known
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>Surface targets</title>
 <meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">

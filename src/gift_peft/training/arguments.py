@@ -250,6 +250,10 @@ class GiftTrainingArguments:
             raise ValueError(f"checkpoint_at_steps: expected numbers of updates, got {given!r}") from None
         if any(step < 1 for step in self.checkpoint_at_steps):
             raise ValueError(f"checkpoint_at_steps: must be at least 1, got {min(self.checkpoint_at_steps)}")
+        # transformers takes True for the newest checkpoint as well; of a bare true YAML leaves the word yes.
+        words = {"true": "latest", "yes": "latest", "false": None, "no": None}
+        given = self.resume_from_checkpoint
+        self.resume_from_checkpoint = words.get(str(given).lower(), given)
         self._check_recipe()
         self._check_objective()
         if self.overwrite_output_dir and self.resume_from_checkpoint:
@@ -377,6 +381,8 @@ def _yaml_to_argv(path: Path) -> list[str]:
             raise ValueError(f"config {path}: {key}: expected one value, not a list")
         if isinstance(value, bool) and types[key] is not bool:
             value = "yes" if value else "no"  # what YAML makes of `mixed_precision: no`
+        if isinstance(value, float) and types[key] is int and value.is_integer():
+            value = int(value)  # `num_train_epochs: 3.0`, as transformers writes it
         if isinstance(value, list):
             argv += [f"--{key}", *map(str, value)] if value else []
         elif value is not None:

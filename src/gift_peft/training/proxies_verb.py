@@ -7,7 +7,7 @@ from itertools import chain
 from pathlib import Path
 
 from gift_peft.dataset.proxies import SURFACE_SUFFIX, SurfaceSettings, read_header
-from gift_peft.files import write_whole
+from gift_peft.files import check_own_file, write_whole
 from gift_peft.options import OptionParser, add_base, add_dataset
 from gift_peft.rules import KINDS
 from gift_peft.surface_targets import MODELS
@@ -53,6 +53,10 @@ def run(argv: Sequence[str]) -> int:
     from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
     from gift_peft.training.teacher import make_proxies, told_of_surface
 
+    if args.page:
+        from gift_peft.reports.targets_page import MARK
+
+        check_own_file(args.page, MARK, "--page")
     folder = make_proxies(
         args.base,
         args.dataset,

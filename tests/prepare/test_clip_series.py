@@ -112,4 +112,6 @@ def test_forty_clips(stills, tmp_path):
         f"rightly; {frames / spent:.0f} frames a second at {SIZE[1]}x{SIZE[0]}"
     )
     assert found >= 0.95 * views and busy == 0
-    assert split >= 0.9 * pushes  # the aim is all of them; some pushes are missed, or a short last pose is left out
+    assert (
+        split >= 0.95 * pushes
+    )  # the aim is all of them; a push of a few pixels is missed where little can be tracked

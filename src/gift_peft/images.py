@@ -31,6 +31,7 @@ SUFFIXES = JPEG_SUFFIXES | {".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".
 HEIF_SUFFIXES = {".heic", ".heif", ".hif"}
 HEIF_BRANDS = {b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"}
 HEIF_HINT = "pip install 'gift-peft[heif]' reads HEIC, or export it as JPEG"
+BOMB = Image.DecompressionBombError
 LOSSY = {"JPEG", "MPO", "WEBP", "AVIF", "HEIF"}  # formats that do not keep the values of a mask
 # Files that people and cameras put beside photos and that are no pictures.
 COMPANIONS = {
@@ -100,7 +101,8 @@ def open_image(source: str | Path | bytes | Image.Image, name: str | None = None
         dangling = isinstance(source, str | Path) and Path(source).is_symlink()
         why = "; the link leads nowhere: fetch its content (git annex get, dvc pull, hf download)" if dangling else ""
         raise FileNotFoundError(f"{name}: no such file{why}") from None
-    except (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError) as error:
+    # TypeError and LookupError: a TIFF whose tags are damaged.
+    except (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, struct.error, BOMB) as error:
         if _is_heif(source) and not reads_heif():
             hint = f"; it is HEIC: {HEIF_HINT}"
         elif is_lfs_pointer(_start(source)):

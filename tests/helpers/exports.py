@@ -33,11 +33,13 @@ def pixels(batch: int, height: int, width: int) -> torch.Tensor:
 
 
 def limit(model: DepthModel, x: torch.Tensor) -> float:
-    """How far from torch a right graph may be: 1e-5, or what torch itself is from float64, three times.
+    """How far from torch a right graph may be: 2e-5, or what torch itself is from float64, three times.
+
+    Most processors stay below 1e-5; others sum in another order.
 
     The tiny random networks multiply rounding, Metric3D's recurrence most; a trained one does not.
     """
     single = model.predict(x).numpy()
     with torch.no_grad():
         double = copy.deepcopy(model.network).double()(pixel_values=x.double()).predicted_depth.numpy()
-    return max(1e-5, 3 * relative(single, double))
+    return max(2e-5, 3 * relative(single, double))

@@ -29,7 +29,7 @@ from gift_peft.files import reason, whole_folder
 
 OPSET = 20  # the first with Gelu
 TRACED = 8, 10  # patches; neither square nor a size that anybody asks for
-INT8_ERROR = 0.005  # mean error of an 8-bit model, relative to the mean of the output
+INT8_ERROR = 0.005  # mean error on the reference pictures, relative to the mean of the output
 INT8_PARTS = 24  # of a network whose whole costs more than that
 
 

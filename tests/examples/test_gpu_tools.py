@@ -18,6 +18,8 @@ TOOLS = Path(__file__).parents[2] / "examples" / "tools"
 @pytest.fixture
 def roofline(monkeypatch):
     monkeypatch.syspath_prepend(str(TOOLS))
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmark"]:
+        monkeypatch.delitem(sys.modules, name)  # another test's file of that name
     import roofline
 
     return roofline

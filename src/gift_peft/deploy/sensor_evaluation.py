@@ -5,7 +5,6 @@ place. The sensor alone is compared with the base and the adapted model aligned 
 no model: the border painted inwards, and the plane of a ring about the target.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,10 +18,9 @@ from gift_peft.dataset.rows import parsed
 from gift_peft.deploy.sensor import fill_sensor_depth
 from gift_peft.deploy.sensor_files import DEPTH_SUFFIXES, list_files, pair_files, read_depth, to_size
 from gift_peft.evaluation.metrics import METRICS, depth_metrics
-from gift_peft.evaluation.results import REGIONS, mean
+from gift_peft.evaluation.results import REGIONS, mean, write_results
 from gift_peft.evaluation.table_formats import Cell, Table, value_cell
 from gift_peft.evaluation.tables import METRIC_NAMES, REGION_NAMES
-from gift_peft.files import jsonable, write_whole
 from gift_peft.models.loading import DepthModel
 from gift_peft.rules import GroupPictures, parse_group
 
@@ -52,12 +50,8 @@ class SensorReport:
 
     def save(self, folder: str | Path) -> Path:
         """Writes `sensor.json` and `sensor_rows.jsonl`; returns the folder."""
-        folder = Path(folder)
-        lines = "".join(json.dumps(jsonable(row)) + "\n" for row in self.rows)
-        write_whole(folder / "sensor_rows.jsonl", lines)
-        facts = jsonable({"unit": "mm", "summary": self.summary, "coverage": self.coverage})
-        write_whole(folder / "sensor.json", json.dumps(facts, indent=2) + "\n")
-        return folder
+        facts = {"unit": "mm", "summary": self.summary, "coverage": self.coverage}
+        return write_results(folder, self.rows, facts, ("sensor.json", "sensor_rows.jsonl"))
 
     def table(self) -> Table:
         """Errors per method inside and outside the target."""

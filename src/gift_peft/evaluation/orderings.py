@@ -4,7 +4,6 @@ A question is a list of points of one photo; it is answered right if predicted d
 is right / all over the questions of all photos. `layered_depth` and `md3k` beside it read the data.
 """
 
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -15,8 +14,9 @@ import numpy as np
 from tqdm import tqdm
 
 from gift_peft.evaluation.alignment import resize_prediction, to_numpy
+from gift_peft.evaluation.results import write_results
 from gift_peft.evaluation.stored_predictions import find_stored, read_stored, require_stored
-from gift_peft.files import jsonable, write_whole
+from gift_peft.files import jsonable
 from gift_peft.images import read_image
 from gift_peft.models.loading import DepthModel
 from gift_peft.rules import KINDS
@@ -74,11 +74,7 @@ class OrderingReport:
 
     def save(self, folder: str | Path) -> Path:
         """Writes `metrics.json` and `rows.jsonl`, each at once or not at all; returns the folder."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / "rows.jsonl", "".join(json.dumps(jsonable(row)) + "\n" for row in self.rows))
-        write_whole(folder / "metrics.json", json.dumps(self.to_dict(), indent=2) + "\n")
-        return folder
+        return write_results(folder, self.rows, self.to_dict())
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "OrderingReport":

@@ -89,11 +89,7 @@ class Report:
 
     def save(self, folder: str | Path) -> Path:
         """Writes `metrics.json` and `rows.jsonl`, each at once or not at all; returns the folder."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / "rows.jsonl", "".join(json.dumps(jsonable(row)) + "\n" for row in self.rows))
-        write_whole(folder / "metrics.json", json.dumps(self.to_dict(), indent=2) + "\n")
-        return folder
+        return write_results(folder, self.rows, self.to_dict())
 
     @classmethod
     def load(cls, folder: str | Path) -> "Report":
@@ -116,6 +112,17 @@ class Report:
             if keys:
                 raise ValueError(f"{path} is no evaluation: it {verb} {', '.join(sorted(keys))}")
         return cls(rows=rows, dataset=dataset, **{names[key]: value for key, value in values.items()})
+
+
+def write_results(
+    folder: str | Path, rows: list[dict], values: dict, names: tuple[str, str] = ("metrics.json", "rows.jsonl")
+) -> Path:
+    """The two files of an evaluation, each at once or not at all; returns the folder, which is made if it is new."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / names[1], "".join(json.dumps(jsonable(row)) + "\n" for row in rows))
+    write_whole(folder / names[0], json.dumps(jsonable(values), indent=2) + "\n")
+    return folder
 
 
 def _json_keys(dataset: str) -> dict[str, str]:

@@ -17,6 +17,8 @@ from gift_peft.evaluation.evaluate import REFERENCES, Scorer, Task
 from gift_peft.evaluation.protocols import get_protocol
 from gift_peft.evaluation.samples import Observation
 from gift_peft.evaluation.statistics import GroupBootstrap
+from gift_peft.evaluation.tables import counted
+from gift_peft.losses import prediction_spread
 from gift_peft.models.pixels import resize_mask
 from gift_peft.rules import GroupPictures
 from gift_peft.surface_targets import SurfaceTarget
@@ -45,7 +47,7 @@ def describe(group: GroupPictures, proxies: torch.Tensor, found: SurfaceTarget, 
         size = base.shape[0], base.shape[1]
         region = torch.from_numpy(resize_mask(group.masks[index], size) & resize_mask(valid, size))
         row: dict = {"image": name, "nearer": None, "moved": None}
-        spread = _spread(base[torch.from_numpy(resize_mask(valid, size))])
+        spread = prediction_spread(base.double(), torch.from_numpy(resize_mask(valid, size)))
         if region.any() and spread:
             moved = (target - base)[region].double().numpy()
             row["nearer"] = float(np.mean(moved > 0 if kind == "inverse_depth" else moved < 0))
@@ -72,10 +74,6 @@ def _errors(
     return errors if all(map(math.isfinite, errors)) else None
 
 
-def _spread(values: torch.Tensor) -> float:
-    return float(np.subtract(*np.percentile(values.double().numpy(), (95, 5)))) if values.numel() else 0.0
-
-
 def _known(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
@@ -95,7 +93,7 @@ def surface_lines(groups: Iterable[tuple[str, dict]]) -> list[str]:
             kinds.setdefault(told["surface"] or "unknown surface", []).append((group_id, told))
     lines = []
     for kind in sorted(kinds):
-        start = f"{kind} ({_count(len(kinds[kind]), 'group')})"
+        start = f"{kind} ({counted(len(kinds[kind]), 'group')})"
         measured = [line for against in AGAINST if (line := _measured(kinds[kind], against))]
         lines += [f"{start}: {line}" for line in measured or [_described(kinds[kind])]]
     return lines
@@ -118,7 +116,7 @@ def _measured(groups: Sequence[tuple[str, dict]], against: str) -> str:
     unit = " mm" if against == "depth" else ""
     change = f"{100 * (after / before - 1):+.0f} %{interval}" if before else "unknown"
     compared = len({row["group_id"] for row in rows})
-    among = f", of {_count(compared, 'group')} that have it" if compared < len(groups) else ""
+    among = f", of {counted(compared, 'group')} that have it" if compared < len(groups) else ""
     return (
         f"error inside the target against {AGAINST[against]}{among}: {before:.3g}{unit} of the base, "
         f"{after:.3g}{unit} of the surface target ({change})"
@@ -137,7 +135,3 @@ def _described(groups: Sequence[tuple[str, dict]]) -> str:
         if values:
             text += f"; {told_as} {np.mean(values):.1%}"
     return f"{text} (no treated reference or true depth here says whether that is right)"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' * (number != 1)}"

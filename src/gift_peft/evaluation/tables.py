@@ -124,9 +124,9 @@ def skipped_note(report: Report) -> str:
     reasons = ", ".join(f"{n} {reason}" for reason, n in counts["reasons"].items())
     other = f", {counts['without_other']} with nothing else" if counts["without_other"] else ""
     return (
-        f"Skipped: {counts['skipped']} of {_count(counts['images'], 'image')}{f' ({reasons})' if reasons else ''}; "
+        f"Skipped: {counts['skipped']} of {counted(counts['images'], 'image')}{f' ({reasons})' if reasons else ''}; "
         f"{counts['without_tom']} without known target pixels{other}; {report.gce_name} over "
-        f"{_count(gce['num_groups'], report.group_noun)}, {gce['num_skipped']} without a pair."
+        f"{counted(gce['num_groups'], report.group_noun)}, {gce['num_skipped']} without a pair."
     )
 
 
@@ -301,9 +301,10 @@ def _title(report: Report, with_counts: bool = True) -> str:
         split = report.about.get("split")
         name = f"GIFT-I{f' {split}' if split else ''} against {against}"
     counts = report.counts
-    size = f": {_count(counts['groups'], report.group_noun)}, {_count(counts['images'], 'image')}"
+    size = f": {counted(counts['groups'], report.group_noun)}, {counted(counts['images'], 'image')}"
     return f"{name}{size if with_counts else ''} ({report.unit})"
 
 
-def _count(n: int, noun: str) -> str:
+def counted(n: int, noun: str) -> str:
+    """ "1 group", "2 groups"."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"

@@ -15,6 +15,7 @@ from gift_peft.options import OptionParser, add_adapter, add_base, add_dataset, 
 if TYPE_CHECKING:
     from gift_peft.evaluation.orderings import OrderingReport
     from gift_peft.evaluation.results import Report
+    from gift_peft.models.loading import DepthModel
 
 DATASETS = ("dataset", "booster", "layereddepth", "md3k")  # options, of which one is given
 
@@ -52,20 +53,12 @@ def run_evaluation(
     from gift_peft.evaluation.booster_scenes import find_booster
     from gift_peft.evaluation.evaluate import evaluate_booster, evaluate_gift_i
     from gift_peft.evaluation.tables import markdown_table, text_table
-    from gift_peft.models.adapter_base import find_base
-    from gift_peft.models.loading import DepthModel
 
     _check_place(Path(out))
     if booster:  # fail early: large weights take minutes to load
         get_protocol(options.get("protocol", "gift"))
         find_booster(booster, options.get("subset"), options.get("official"))
-    if base is None and adapter is not None:
-        base, revision = find_base(None, adapter, revision)
-    model = (
-        None
-        if base is None
-        else DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
-    )
+    model, about = _load(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
     if booster:
         report = evaluate_booster(booster, model, predictions, kind if model is None else None, **options)
     elif dataset is None:
@@ -75,19 +68,28 @@ def run_evaluation(
         report = evaluate_gift_i(groups, model, **options)
         report.about = {"dataset": str(dataset), "dataset_revision": dataset_revision, "split": split}
     if model is not None:
-        report.about |= {
-            "base": str(base),
-            "revision": revision,
-            "adapter": adapter and str(adapter),
-            "adapter_scale": adapter_scale,
-            "size": list(model.size),
-            "kind": model.kind,
-        }
+        report.about |= about | {"kind": model.kind}
     folder = report.save(out)
     write_whole(folder / "report.md", markdown_table(report))
     print(text_table(report, color=color))
     print(f"Written: {folder}/metrics.json, rows.jsonl, report.md")
     return report
+
+
+def _load(
+    base, adapter, adapter_scale, revision, size, kind, device, accept_base
+) -> tuple["DepthModel | None", dict[str, Any]]:
+    """The model and what a report says about it; neither where stored predictions stand in for it."""
+    from gift_peft.models.adapter_base import find_base
+    from gift_peft.models.loading import DepthModel
+
+    if base is None and adapter is not None:
+        base, revision = find_base(None, adapter, revision)
+    if base is None:
+        return None, {}
+    model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
+    about = {"base": str(base), "revision": revision, "adapter": adapter and str(adapter)}
+    return model, about | {"adapter_scale": adapter_scale, "size": list(model.size)}
 
 
 def _check_place(folder: Path) -> None:
@@ -128,29 +130,14 @@ def run_orderings(
     from gift_peft.evaluation.layered_depth import evaluate_layered_depth, find_layered_depth
     from gift_peft.evaluation.md3k import evaluate_md3k, read_md3k
     from gift_peft.evaluation.ordering_tables import ordering_markdown, ordering_text
-    from gift_peft.models.adapter_base import find_base
-    from gift_peft.models.loading import DepthModel
 
     _check_place(Path(out))
     evaluate = {"layereddepth": evaluate_layered_depth, "md3k": evaluate_md3k}[name]
     if base is not None or adapter is not None:  # fail early: large weights take minutes to load
         read_md3k(root) if name == "md3k" else find_layered_depth(root, options.get("partial", False))
-    if base is None and adapter is not None:
-        base, revision = find_base(None, adapter, revision)
-    model = (
-        None
-        if base is None
-        else DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
-    )
+    model, about = _load(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
     report = evaluate(root, model, predictions, kind if model is None else None, **options)
-    if model is not None:
-        report.about |= {
-            "base": str(base),
-            "revision": revision,
-            "adapter": adapter and str(adapter),
-            "adapter_scale": adapter_scale,
-            "size": list(model.size),
-        }
+    report.about |= about
     folder = report.save(out)
     write_whole(folder / "report.md", ordering_markdown(report))
     print(ordering_text(report, color=color))

@@ -204,6 +204,11 @@ def unfetched(folder: str | Path) -> str | None:
     return None
 
 
+def existing_folder(path: Path) -> Path:
+    """The path itself, or the nearest folder above it that is there: whose disk and permissions a new folder has."""
+    return next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+
+
 # ---- small files ----
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gift_peft.captures.tree import Capture, check_masks
+from gift_peft.files import existing_folder
 from gift_peft.prepare.clip_groups import is_clip_job
 from gift_peft.prepare.group import prepare_group
 from gift_peft.prepare.job import Job, capture_digest, group_choices, printable
@@ -100,7 +101,7 @@ def _estimate(new: list[Planned], out: Path, num_proc: int) -> str:
         prepare_group(replace(job, staging=Path(folder), known=None, proposed=None))
         seconds = (time.monotonic() - start) / frames * total / min(num_proc, len(new))
         size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file()) / frames * total
-    place = next(parent for parent in (out.absolute(), *out.absolute().parents) if parent.exists())
+    place = existing_folder(out)
     free = shutil.disk_usage(place).free
     short = "" if size < free else f"; only {free / 2**20:.0f} MiB are free"
     text = f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

@@ -24,6 +24,7 @@ from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.proxies import default_proxies_dir
 from gift_peft.dataset.rows import parsed
 from gift_peft.dataset.tensors import Group, collate_group
+from gift_peft.files import existing_folder
 from gift_peft.group_step import GroupStep
 from gift_peft.models.identity import teacher_id
 from gift_peft.models.loading import DepthModel, load_base
@@ -206,7 +207,7 @@ def _tell(
     print(f"Needed: about {SPARE * measured.memory / 2**30:.1f} GiB of {where}, {disk / 2**30:.2f} GiB of disk")
     for line in advice(args, len(train), updates, "validation" in counts):
         print(line)
-    free = shutil.disk_usage(_existing(Path(args.output_dir))).free
+    free = shutil.disk_usage(existing_folder(Path(args.output_dir))).free
     return [f"output_dir: {free / 2**30:.2f} GiB of disk are free"] if free < disk else []
 
 
@@ -245,10 +246,6 @@ def _missing_proxies(args: GiftTrainingArguments, counts: dict[str, dict[str, in
         for group_id, count in groups.items()
         if (split, group_id + (suffix if split == "train" else "")) not in there
     )
-
-
-def _existing(path: Path) -> Path:
-    return next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
 
 
 def _range(values) -> str:

@@ -24,7 +24,7 @@ from accelerate.state import AcceleratorState
 from accelerate.utils import DistributedDataParallelKwargs, ProjectConfiguration, parse_flag_from_env
 
 from gift_peft.evaluation.booster_scenes import find_booster
-from gift_peft.files import reason
+from gift_peft.files import existing_folder, reason
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.checkpoints import find_checkpoint, last_complete, remove_leftovers
 from gift_peft.training.precision import choose_precision
@@ -137,7 +137,7 @@ def check_run(args: GiftTrainingArguments, accelerator: Accelerator, prepare: bo
     check_folder(output, args)
     if prepare:
         output.mkdir(parents=True, exist_ok=True)
-    place = next(folder for folder in (output.absolute(), *output.absolute().parents) if folder.exists())
+    place = existing_folder(output)
     if not os.access(place, os.W_OK):
         raise PermissionError(f"output_dir: {output} cannot be written")
     if args.booster_root is not None:

@@ -1,7 +1,6 @@
 """COCO's JSON, one file for many images, as CVAT, Label Studio, Roboflow, RectLabel and others write it."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,7 @@ from gift_peft.captures.labels import (
     relative_name,
     without_query,
 )
-from gift_peft.captures.shapes import NoArea, polygon_mask, rectangle_points, union
+from gift_peft.captures.shapes import polygon_mask, rectangle_points, union
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class CocoImage:
         names = choose_labels(known, mask_class, "categories") if known else []
         chosen = set().union(*(self.categories[name] for name in names))
         shown = [item for item in self.annotations if _id(item.get("category_id")) in chosen]
-        return union(_each(shown, size), size)
+        return union(coco_mask, shown, size)
 
 
 def coco_images(content: dict) -> dict[str, CocoImage]:
@@ -105,25 +104,13 @@ def coco_mask(annotation: dict, size: tuple[int, int]) -> np.ndarray:
         raise ValueError("a segmentation is neither polygons nor run lengths")
     if _is_box_to_turn(segmentation, annotation):
         raise ValueError("a box with a rotation beside it, whose segmentation is not turned; export it as a polygon")
-    return union(_rings(segmentation, size), size)  # the parts of one object
+    return union(_ring_mask, segmentation, size)  # the parts of one object
 
 
-def _each(annotations: list[dict], size: tuple[int, int]) -> Iterator[np.ndarray | NoArea]:
-    for annotation in annotations:
-        try:
-            yield coco_mask(annotation, size)
-        except NoArea as error:
-            yield error
-
-
-def _rings(rings: list[list], size: tuple[int, int]) -> Iterator[np.ndarray | NoArea]:
-    for ring in rings:
-        if len(ring) % 2:
-            raise ValueError("a polygon's list of x, y, x, y, ... has an odd length")
-        try:
-            yield polygon_mask(list(zip(ring[::2], ring[1::2], strict=True)), size)
-        except NoArea as error:
-            yield error
+def _ring_mask(ring: list, size: tuple[int, int]) -> np.ndarray:
+    if len(ring) % 2:
+        raise ValueError("a polygon's list of x, y, x, y, ... has an odd length")
+    return polygon_mask(list(zip(ring[::2], ring[1::2], strict=True)), size)
 
 
 def _box(annotation: dict) -> np.ndarray:

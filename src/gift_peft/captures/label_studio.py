@@ -44,7 +44,7 @@ class LabelStudioImage:
     def read(self, size: tuple[int, int], mask_class: MaskClass) -> np.ndarray:
         """(H, W) bool target of an image of `size` (width, height); ValueError for anything wrong."""
         chosen = choose_labels(self.labels, mask_class, "labels") if self.labels else []
-        return union(_each([region for label, region in self.regions if label in chosen], size), size)
+        return union(label_studio_mask, [region for label, region in self.regions if label in chosen], size)
 
 
 def label_studio_images(content: list) -> dict[str, LabelStudioImage]:
@@ -140,14 +140,6 @@ def _own_label(result: dict) -> str | None:
     kind, value = result.get("type"), result.get("value")
     given = value.get(kind) if isinstance(value, dict) and isinstance(kind, str) else None
     return given[0] if isinstance(given, list) and given else None
-
-
-def _each(regions: list[dict], size: tuple[int, int]) -> Iterator[np.ndarray | NoArea]:
-    for region in regions:
-        try:
-            yield label_studio_mask(region, size)
-        except NoArea as error:
-            yield error
 
 
 def _unpack(packed, count: int) -> np.ndarray:

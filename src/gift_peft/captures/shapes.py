@@ -5,7 +5,8 @@ left out between them. Nothing larger than the image is allocated.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -61,17 +62,19 @@ def ellipse_points(x: float, y: float, radius_x: float, radius_y: float, degrees
     return np.stack([radius_x * np.cos(angle), radius_y * np.sin(angle)], axis=1) @ _turn(degrees) + (x, y)
 
 
-def union(masks: Iterable[np.ndarray | NoArea], size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool of all shapes together. Those without an area are left out, unless there is nothing else: then the
-    first of them is raised.
+def union(
+    draw: Callable[[Any, tuple[int, int]], np.ndarray], shapes: Iterable[Any], size: tuple[int, int]
+) -> np.ndarray:
+    """(H, W) bool of all shapes together, each by `draw(shape, size)`. Those without an area (`NoArea`) are left out,
+    unless there is nothing else: then the first of them is raised.
     """
     mask, lacking, found = np.zeros(size[::-1], bool), None, False
-    for part in masks:
-        if isinstance(part, NoArea):
-            lacking = lacking or part
-        else:
-            mask |= part
+    for shape in shapes:
+        try:
+            mask |= draw(shape, size)
             found = True
+        except NoArea as error:
+            lacking = lacking or error
     if lacking is not None and not found:
         raise lacking
     return mask

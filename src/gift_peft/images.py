@@ -31,6 +31,7 @@ SUFFIXES = JPEG_SUFFIXES | {".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".
 HEIF_SUFFIXES = {".heic", ".heif", ".hif"}
 HEIF_BRANDS = {b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"}
 HEIF_HINT = "pip install 'gift-peft[heif]' reads HEIC, or export it as JPEG"
+PREDICTED = ("Software", "gift-peft predict")  # a text in the PNGs of `predict`: what lacks it is somebody's own
 BOMB = Image.DecompressionBombError
 LOSSY = {"JPEG", "MPO", "WEBP", "AVIF", "HEIF"}  # formats that do not keep the values of a mask
 # Files that people and cameras put beside photos and that are no pictures.

@@ -19,16 +19,13 @@ from tqdm import tqdm
 
 from gift_peft.deploy.metric_options import add_metric_options, check_metric_options, make_outputs, run_video
 from gift_peft.files import check_inputs_stay, write_whole
-from gift_peft.images import list_images
+from gift_peft.images import PREDICTED, list_images
 from gift_peft.options import OptionParser, add_adapter, add_base
 
 if TYPE_CHECKING:
     import torch
 
     from gift_peft.deploy.metric_outputs import MetricOutputs
-
-
-MARK = ("Software", "gift-peft predict")  # a text in our PNGs: what lacks it is somebody's own
 
 
 class PicturesWithoutDepth(ValueError):
@@ -113,7 +110,7 @@ def predict_images(
         model = DepthModel.from_pretrained(base, adapter, adapter_scale, revision, size, kind, device, accept_base)
     folder.mkdir(parents=True, exist_ok=True)
     mark = PngInfo()
-    mark.add_text(*MARK)
+    mark.add_text(*PREDICTED)
     made, wrong = [], []
     results = predict_ahead(model, files, beside, focal_length, batch_size)
     for file, name, result in tqdm(
@@ -159,7 +156,7 @@ def _check_outputs(folder: Path, stems: Sequence[str], files: Sequence[Path]) ->
 def _is_ours(picture: Path) -> bool:
     try:
         with Image.open(picture) as image:
-            return image.info.get(MARK[0]) == MARK[1]
+            return image.info.get(PREDICTED[0]) == PREDICTED[1]
     except (OSError, ValueError, SyntaxError):
         return False
 

@@ -18,7 +18,7 @@ from gift_peft.deploy.sensor import fill_sensor_depth
 from gift_peft.deploy.sensor_checks import check_registration
 from gift_peft.deploy.sensor_files import SensorFiles
 from gift_peft.files import jsonable, write_whole
-from gift_peft.images import read_image
+from gift_peft.images import PREDICTED, read_image
 
 FARTHEST = 65535  # of a 16-bit picture
 SUMMARY = "metric.json"
@@ -174,7 +174,7 @@ def encode_png16(millimetres: np.ndarray, unit: str) -> bytes:
 
 def _png(values: np.ndarray, text: dict[str, str] | None = None) -> bytes:
     info, content = PngInfo(), io.BytesIO()
-    for key, value in ({"Software": "gift-peft predict"} | (text or {})).items():
+    for key, value in (PREDICTED, *(text or {}).items()):
         info.add_text(key, value)
     Image.fromarray(values).save(content, "PNG", pnginfo=info)
     return content.getvalue()

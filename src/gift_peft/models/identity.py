@@ -7,9 +7,7 @@ the same model.
 import functools
 import hashlib
 import json
-import pickle
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +17,8 @@ if TYPE_CHECKING:
     import torch
 
 TENSORS, FILES = "tensors:", "sha256:"  # what pins a folder's weights, now and in 0.1.0
-# What transformers loads weights from, in its order.
-WEIGHTS = ("model.safetensors", "model.safetensors.index.json", "pytorch_model.bin", "pytorch_model.bin.index.json")
+# What weights are loaded from, in transformers' order; a base of pickles alone is refused.
+WEIGHTS = ("model.safetensors", "model.safetensors.index.json")
 # Of config.json: what says nothing of the predictions, or changes when a model is saved again.
 NOT_COMPARED = {"_name_or_path", "architectures", "auto_map", "dtype", "torch_dtype", "transformers_version"}
 
@@ -50,6 +48,11 @@ def adapter_as_base(base: str | Path) -> ValueError:
         "the run's command with --resume_from_checkpoint latest. To train on top of it, merge it first: "
         f'PeftModel.from_pretrained(base, "{base}").merge_and_unload().save_pretrained("merged")'
     )
+
+
+def pickles_alone(base: str | Path) -> ValueError:
+    """The error for a base without safetensors: a pickle could run code."""
+    return ValueError(f"base model {base}: it has pickled weights only (.bin); take safetensors")
 
 
 def teacher_revision(base: str | Path, revision: str | None = None) -> str:
@@ -109,7 +112,7 @@ def _config_file(base: str | Path, revision: str | None) -> Path:
 
 
 def _weight_files(folder: Path, base: str | Path) -> list[Path]:
-    """The files that transformers loads; empty where there is none."""
+    """The files that weights are loaded from; empty where there is none."""
     for name in WEIGHTS:
         path = folder / name
         if path.is_file() and path.suffix != ".json":
@@ -120,6 +123,8 @@ def _weight_files(folder: Path, base: str | Path) -> list[Path]:
                 return sorted(folder / Path(shard).name for shard in named)
             except (ValueError, LookupError, TypeError, AttributeError) as error:
                 raise ValueError(f"base model {base}: {name} is damaged ({reason(error)})") from None
+    if any(folder.glob("*.bin")):
+        raise pickles_alone(base)
     return []
 
 
@@ -145,42 +150,23 @@ def _digest_tensors(stats: tuple[tuple[str, int, int], ...], base: str) -> tuple
             tensor = tensor.float() if tensor.is_floating_point() else tensor
             layout.update(f"{name} {tuple(tensor.shape)}\n".encode())
             values.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    except pickle.UnpicklingError:
-        raise ValueError(
-            f"base model {base}: its weights are a pickle that would run code; take safetensors"
-        ) from None
     except (SafetensorError, RuntimeError, ValueError, LookupError, EOFError, TypeError, AttributeError) as error:
         raise ValueError(f"base model {base}: its weights cannot be read ({reason(error)})") from None
-    finally:
-        _pickled.cache_clear()
     return str(len(places)), layout.hexdigest(), values.hexdigest()
 
 
-def _names(path: Path) -> Iterator[str]:
-    if path.suffix != ".safetensors":
-        yield from _pickled(path)
-        return
+def _names(path: Path) -> list[str]:
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as file:
-        yield from file.keys()
+        return list(file.keys())
 
 
 def _tensor(path: Path, name: str) -> "torch.Tensor":
-    if path.suffix != ".safetensors":
-        return _pickled(path)[name]
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as file:
         return file.get_tensor(name)
-
-
-@functools.lru_cache(maxsize=64)
-def _pickled(path: Path) -> dict[str, "torch.Tensor"]:
-    """Tensors of a .bin file, which stay on the disk until they are used; nothing in it is run."""
-    import torch
-
-    return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
 
 
 def _digest_config(folder: Path) -> str:

@@ -24,7 +24,7 @@ from gift_peft.files import reason, unfetched
 from gift_peft.images import given_picture
 from gift_peft.models.adapter_base import check_base, find_base
 from gift_peft.models.full_precision import without_tf32
-from gift_peft.models.identity import adapter_as_base, check_base_name
+from gift_peft.models.identity import adapter_as_base, check_base_name, pickles_alone
 from gift_peft.models.pixels import resolve_size, to_pixel_values
 from gift_peft.rules import KINDS, UNKNOWN
 
@@ -345,7 +345,7 @@ def load_base(base: str | Path, revision: str | None = None, with_processor: boo
         processor = load_processor(base, revision) if with_processor else None
     except OSError as error:
         if "safetensors" in str(error) and Path(base).is_dir() and any(Path(base).glob("*.bin")):
-            raise ValueError(f"base model {base}: it has pickled weights only (.bin); take safetensors") from None
+            raise pickles_alone(base) from None
         raise FileNotFoundError(f"base model {base}: {reason(error)}") from error
     except (ValueError, RuntimeError, SafetensorError) as error:  # of another shape, cut off, no tensors
         raise ValueError(f"base model {base}: {unfetched(base) or reason(error)}") from error

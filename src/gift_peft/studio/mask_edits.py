@@ -1,7 +1,7 @@
 """What somebody draws on a photo, as a list of edits, and the mask that it comes to.
 
-The page keeps the list and the server draws it, so that undoing is leaving out the last one, and what is saved is drawn
-at the photo's own size. Places are shares of the photo's width and height, from 0 to 1.
+The page keeps the list and the server draws it, so that undoing is leaving out the last one, and what is saved is
+drawn at the photo's own size. Places are shares of the photo's width and height, from 0 to 1.
 
     {"tool": "click", "x": .5, "y": .4, "target": true}      beside the target: false
     {"tool": "brush", "points": [[.1, .2], ...], "size": .02, "target": true}      size: diameter, of the width

@@ -194,7 +194,6 @@ def _draw_border(
 
 def _surroundings(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
     """The box around a mask and a margin: GrabCut's time goes with its pixels."""
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    return slice(max(rows[0] - margin, 0), rows[-1] + margin + 1), slice(
-        max(columns[0] - margin, 0), columns[-1] + margin + 1
-    )
+    spans = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    rows, columns = (slice(max(span[0] - margin, 0), span[-1] + margin + 1) for span in spans)
+    return rows, columns

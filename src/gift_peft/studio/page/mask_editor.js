@@ -62,7 +62,7 @@ async function open(name, quiet = false) {
   }, 700);
   const view = await ask("open");
   clearInterval(watch);
-  if (asked !== room.asked || view.error) return;
+  if (asked !== room.asked || view.error) return false;
   room.view = view;
   room.pictures = {};
   room.photo = view.photos.some((one) => one.name === room.photo) ? room.photo : view.photos.at(-1).name;
@@ -78,6 +78,7 @@ async function open(name, quiet = false) {
   }
   strip();
   await show();
+  return true;
 }
 
 function strip() {
@@ -186,8 +187,7 @@ async function save(version = room.version) {
   say(`Saved: ${answer.saved}. Looking at the group again with it.`);
   const group = room.group;
   await list(group);
-  await open(group, true);
-  if (group === room.group) say(`Saved: ${answer.saved}.`);
+  if (await open(group, true)) say(`Saved: ${answer.saved}.`);
 }
 
 const actions = {

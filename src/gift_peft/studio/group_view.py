@@ -25,6 +25,8 @@ from gift_peft.prepare.settings import PrepareSettings
 from gift_peft.studio.mask_edits import View
 
 SIDE = 960  # pixels: the longer side of what is shown and judged; what is drawn is kept at the photo's own size
+CHANGE_SIDE = 640  # of the comparison, which takes its time; the picture shows where borders are exactly
+LEAST_SIDE = 400  # small photos are enlarged to about that: a border is found between their pixels
 Said = Callable[[], str]  # what is being done, in words, when it is asked
 SETTINGS = PrepareSettings(propose_masks=True)  # nothing is accepted: a group without masks is looked at all the same
 
@@ -82,7 +84,7 @@ class GroupView:
             scale = np.diag([width / self.size[0], height / self.size[1], 1.0])
             back = scale @ np.linalg.inv(self.matrices[index]) @ np.linalg.inv(scale)
             change = cv2.warpPerspective(self.whole.change, back, (width, height), flags=cv2.INTER_LINEAR)
-            picture = shrink(np.asarray(read_image(self.capture.images[index])))
+            picture = at_working_size(np.asarray(read_image(self.capture.images[index])))
             self.own[index] = replace(self.whole, picture=picture, change=change, drawn={})
         return self.own[index]
 
@@ -125,10 +127,11 @@ def look_at(
     pictures, size = _pictures(capture, matrices)
     compared = [picture for picture, frame in zip(pictures, observations, strict=True) if frame["status"] != "dropped"]
     if capture.reference is not None and len(compared) < 2:
-        compared.insert(0, shrink(np.asarray(read_image(capture.reference))))
+        compared.insert(0, at_working_size(np.asarray(read_image(capture.reference))))
     change, noise = np.zeros(pictures[0].shape[:2], np.float32), 1.0
     if len(compared) > 1:
-        change, noise = change_map(compared, SIDE)
+        change, noise = change_map(compared, CHANGE_SIDE)
+        change = cv2.resize(change, pictures[0].shape[1::-1], interpolation=cv2.INTER_LINEAR)
     middle = np.median(np.stack(compared or pictures[-1:]), axis=0).astype(np.uint8)
     verdict = [
         remark["text"] for remark in (*entry["reasons"], *entry["warnings"]) if remark["code"] != "masks_proposed"
@@ -159,13 +162,16 @@ def _pictures(capture: Capture, matrices: list[np.ndarray]) -> tuple[list[np.nda
                 f"{path}: {pixels.shape[1]}x{pixels.shape[0]}, and the first photo is {size[0]}x{size[1]}"
             )
         size = pixels.shape[1::-1]
-        pictures.append(shrink(pixels if np.array_equal(matrix, np.eye(3)) else warp(pixels, matrix)))
+        pictures.append(at_working_size(pixels if np.array_equal(matrix, np.eye(3)) else warp(pixels, matrix)))
     return pictures, size
 
 
-def shrink(pixels: np.ndarray) -> np.ndarray:
-    """A picture (H, W, 3) at working size."""
+def at_working_size(pixels: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 3) made smaller, or a small one larger by a whole factor."""
     height, width = pixels.shape[:2]
-    scale = min(1.0, SIDE / max(height, width))
+    longer = max(height, width)
+    scale = SIDE / longer if longer > SIDE else max(1, round(LEAST_SIDE / longer))
+    if scale == 1:
+        return pixels
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA) if scale < 1 else pixels
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)

@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gift_peft.captures.clip_group import find_clip_group
+from gift_peft.captures.folders import PICTURE_MASKS
 from gift_peft.captures.labels import split_classes
 from gift_peft.captures.masks import MaskSource, find_mask
 from gift_peft.captures.tree import read_capture
@@ -84,8 +85,11 @@ def frame_place(frame: Path, folder: Path, root: Path) -> MaskPlace:
 def _in_place_of(source: MaskSource | None, usual: Path) -> Path:
     """A PNG that somebody has drawn is replaced where it lies, so that there are not two; else the usual place."""
     own = source is not None and source.kind == "png" and source.path.suffix == ".png" and len(source.files) == 1
-    near = own and source.path.parent in (usual.parent, usual.parent.parent)
-    return source.path if near and source.path.stem.casefold() == usual.stem.casefold() else usual
+    if not own or source.path.stem.casefold() != usual.stem.casefold():
+        return usual
+    place, there = source.path.parent, usual.parent
+    beside = place.parent == there.parent and {place.name.casefold(), there.name} <= set(PICTURE_MASKS)
+    return source.path if place == there or beside else usual
 
 
 def save_mask(find: Callable[[], MaskPlace], mask: np.ndarray, version: str, root: Path) -> MaskPlace:

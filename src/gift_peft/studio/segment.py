@@ -17,6 +17,7 @@ BAND = 0.02  # of the diagonal: how far a border may be from that of the strong 
 DISK = 0.006  # of the diagonal: what a click surely means
 NEAR = 0.03  # of the diagonal: how far beside a region a click may be and still mean it
 TOLERANCE = 12  # Lab levels (0-255): colors of one thing, where nothing changes
+SURE = 0.7  # of the way to a click beside the target: what is surely of the clicked target
 ROUNDS = 3  # of GrabCut
 CEILING = 8.0  # times the noise: more change says nothing more
 
@@ -139,7 +140,7 @@ def _cut(
     apart, radius = (_distance(places, seed.shape) for places in (hits, misses)), _length(DISK, seed.shape)
     to_hit, to_miss = apart
     markers = np.zeros(seed.shape, np.int32)
-    markers[seed & (to_hit < to_miss)] = 1
+    markers[seed & (to_hit < SURE * to_miss)] = 1
     markers[to_miss <= radius] = 2
     markers[to_hit <= radius] = 1
     parts = cv2.watershed(np.ascontiguousarray(_features(lab, change, noise)), markers)
@@ -176,7 +177,7 @@ def _draw_border(
     if not ((marks == cv2.GC_BGD).any() and (marks == cv2.GC_FGD).any()):
         return seed
     cv2.setRNGSeed(0)  # GrabCut's clusters are drawn; the same clicks shall give the same mask
-    models, part = (np.zeros((1, 65)), np.zeros((1, 65))), _surroundings(around, 2 * reach)
+    models, part = (np.zeros((1, 65)), np.zeros((1, 65))), _surroundings(around, 10 * reach)
     near = np.ascontiguousarray(marks[part])
     if (near == cv2.GC_BGD).any():
         features = np.ascontiguousarray(_features(lab, change, noise)[part])

@@ -38,6 +38,8 @@ POLICY = (
     "base-uri 'self'; form-action 'self'; frame-ancestors 'none'"
 )
 LARGEST_PHOTO = "100mb"
+# The viewer of points tries WebGPU first and complains where a browser has it without a device; WebGL does as well.
+HEAD = "<script>delete Navigator.prototype.gpu;</script>"
 
 
 @dataclass
@@ -169,6 +171,7 @@ def serve(blocks: Any, port: int, folder: Path, opened: bool, ready: Callable[[s
         pwa=False,
         ssr_mode=False,
         strict_cors=True,
+        head=HEAD,
         theme=gr.themes.Default(**fonts),
     )
     try:
@@ -223,11 +226,15 @@ def _targets_tab(gr: Any, room: "TargetRoom", blocks: Any) -> None:
         chosen = gr.Dropdown([*room.sets], value=next(iter(room.sets)), label="Made by", elem_id="set")
         group = gr.Dropdown([], label="Group", elem_id="target-group")
         photo = gr.Dropdown([], label="Photo", elem_id="target-photo")
-    style = ".maps div { display: grid; grid-template-columns: repeat(auto-fit, minmax(14rem, 1fr)); gap: .75rem; } "
-    style += ".maps figure { margin: 0; } .maps img { width: 100%; height: auto; }"
+    style = (
+        "div:has(> figure) { display: grid; grid-template-columns: repeat(auto-fit, minmax(14rem, 1fr)); gap: .7rem }"
+    )
+    style += (
+        " figure { margin: 0 } img { width: 100%; height: auto } h2 { font-size: 1.1rem; overflow-wrap: anywhere }"
+    )
     text = "Inside the outlined target, training pulls the base's prediction to the surface target. Near is bright; "
     gr.Markdown(text + "where the two differ most, their difference is bright.")
-    maps = gr.HTML("", css_template=style, elem_classes=["maps"], elem_id="maps")
+    maps = gr.HTML("", css_template=style, elem_id="maps")
 
     @told
     def of_set(name):
@@ -273,8 +280,8 @@ def _compare_tab(gr: Any, room: "CompareRoom", _: Any) -> None:
             )
             view = gr.Slider(30, 110, 60, step=1, label="Field of view of the camera, degrees (for the points)")
         with gr.Column():
-            said = gr.Markdown("Choose a photo.", elem_id="said")
-            depths = gr.ImageSlider(label="Base (left), adapted (right): near is bright", elem_id="depths")
+            said = gr.Markdown("Choose a photo. Near is bright.", elem_id="said")
+            depths = gr.ImageSlider(label="Base left, adapted right", elem_id="depths")
             cloud = gr.Model3D(label="Points, from the adapted depth", elem_id="points", height=380)
     inputs = [photo, scale]
     photo.change(compare, inputs, [depths, said], concurrency_limit=1).then(points, [*inputs, view], [cloud])

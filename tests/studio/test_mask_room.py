@@ -20,10 +20,10 @@ SIZE = 180, 240
 
 
 def opaque(uri):
-    """(H, W) bool of an overlay that the page shows."""
+    """(H, W) bool of an overlay that the page shows, which small photos get enlarged."""
     picture = Image.open(io.BytesIO(base64.b64decode(uri.split(",", 1)[1])))
-    assert picture.mode == "RGBA"
-    return np.asarray(picture)[..., 3] > 0
+    assert picture.mode == "RGBA" and picture.size == (2 * SIZE[1], 2 * SIZE[0])
+    return cv2.resize(np.asarray(picture)[..., 3], SIZE[::-1], interpolation=cv2.INTER_AREA) > 50
 
 
 def iou(found, mask):
@@ -44,26 +44,37 @@ def take_masks(folder):
 
 
 @pytest.fixture(scope="module")
-def moved_group(tmp_path_factory):
-    """(raw tree of one group whose camera moved once, its true masks)."""
-    root = tmp_path_factory.mktemp("moved") / "raw"
+def opened(tmp_path_factory):
+    """A room with a group that is open, whose camera moved once, and its true masks."""
+    place = tmp_path_factory.mktemp("room")
     rng = np.random.default_rng(0)
-    folder = capture(root / "hall", 11, 4, SIZE, motions=[motion(rng, SIZE, 6.0, 0.3, 0.0)])
-    return root, take_masks(folder)
+    folder = capture(place / "raw" / "hall", 11, 4, SIZE, motions=[motion(rng, SIZE, 6.0, 0.3, 0.0)])
+    masks, room = take_masks(folder), MaskRoom(place / "raw", place / "own")
+    return room, masks, room.open({"group": "train/hall"})
 
 
 @pytest.fixture
-def room(moved_group, tmp_path):
-    root, masks = moved_group
-    shutil.copytree(root, tmp_path / "raw")
-    return MaskRoom(tmp_path / "raw", tmp_path / "own"), masks
+def room(opened):
+    """The room and the true masks; what a test saves goes afterwards."""
+    room, masks, _ = opened
+    files = set((room.root / "hall").iterdir())
+    yield room, masks
+    for path in set((room.root / "hall").iterdir()) - files:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def test_one_click_makes_the_masks_of_all_photos(room):
+@pytest.fixture
+def copy(opened, tmp_path):
+    """A copy of the raw tree, to be changed, in a room of its own, and the true masks."""
+    room, masks, _ = opened
+    return MaskRoom(shutil.copytree(room.root, tmp_path / "raw"), tmp_path / "own"), masks
+
+
+def test_one_click_makes_the_masks_of_all_photos(room, opened):
     """Also of one whose camera had moved: as `prepare` carries it, and as the page has shown it."""
     room, masks = room
     assert [group["state"] for group in room.groups()["groups"]] == ["4 photos, no mask yet"]
-    shown = room.open({"group": "train/hall"})
+    shown = opened[2]
     assert [photo["status"] for photo in shown["photos"]] == ["warped", "identity", "identity", "kept"]
     assert shown["compares"] and not opaque(shown["overlay"]).any() and not shown["there"]
     edits = [click(masks[-1])]
@@ -81,8 +92,8 @@ def test_one_click_makes_the_masks_of_all_photos(room):
     assert again["version"] == saved["version"]
 
 
-def test_what_prepare_says_stands_beside_each_photo(room, tmp_path):
-    room, masks = room
+def test_what_prepare_says_stands_beside_each_photo(copy, tmp_path):
+    room, masks = copy
     folder = room.root / "hall"
     shutil.copy(folder / "1.png", folder / "9.png")
     cv2.imwrite(str(folder / "2.png"), np.random.default_rng(0).integers(0, 255, (*SIZE, 3)))
@@ -99,7 +110,6 @@ def test_what_prepare_says_stands_beside_each_photo(room, tmp_path):
 def test_a_photos_own_mask_is_drawn_on_it_as_it_was_taken(room):
     room, masks = room
     about = {"group": "train/hall", "photo": "0.png"}
-    room.open({"group": "train/hall"})
     edits = [click(masks[0])]
     version = room.start(about)["version"]
     assert iou(opaque(room.draw({**about, "edits": edits})["overlay"]), masks[0]) > 0.95
@@ -114,7 +124,6 @@ def test_a_photos_own_mask_is_drawn_on_it_as_it_was_taken(room):
 
 def test_the_groups_mask_says_which_photos_keep_their_own(room):
     room, masks = room
-    room.open({"group": "train/hall"})
     about = {"group": "train/hall", "edits": [click(masks[-1])]}
     own = {**about, "photo": "3.png"}
     assert "saved" in room.save({**own, "version": room.start(own)["version"]})
@@ -127,7 +136,7 @@ def test_the_groups_mask_says_which_photos_keep_their_own(room):
 def test_two_tabs_do_not_overwrite_each_other(room):
     room, masks = room
     group = {"group": "train/hall"}
-    version = room.open(group)["version"]
+    version = room.start(group)["version"]
     first, second = (
         [click(masks[-1])],
         [click(masks[-1]), {"tool": "brush", "points": [[0.1, 0.1]], "size": 0.1, "target": True}],
@@ -142,7 +151,6 @@ def test_two_tabs_do_not_overwrite_each_other(room):
 
 def test_an_empty_mask_is_of_a_photo_only(room):
     room, _ = room
-    room.open({"group": "train/hall"})
     with pytest.raises(ValueError, match="nothing is drawn"):
         room.save(
             {
@@ -158,10 +166,10 @@ def test_an_empty_mask_is_of_a_photo_only(room):
 def test_an_unreadable_mask_is_told_and_may_be_drawn_anew(room):
     room, masks = room
     (room.root / "hall" / "mask.png").write_bytes(b"no picture")
-    shown = room.open({"group": "train/hall"})
+    shown = room.start({"group": "train/hall"})
     assert "mask.png" in shown["problem"] and shown["there"]
     saved = room.save({"group": "train/hall", "edits": [click(masks[-1])], "version": shown["version"]})
-    assert saved["saved"] == "hall/mask.png" and room.open({"group": "train/hall"})["problem"] is None
+    assert saved["saved"] == "hall/mask.png" and room.start({"group": "train/hall"})["problem"] is None
 
 
 CRAFTED = ["../elsewhere", "/etc", "train/../..", "train/hall/..", "train/hall/../../elsewhere", "..\\x", "", "\0"]
@@ -172,7 +180,6 @@ def test_a_request_names_nothing_but_what_is_listed(room):
     room, masks = room
     outside = room.root.parent
     (outside / "elsewhere").mkdir()
-    room.open({"group": "train/hall"})
     before = {path for path in outside.rglob("*") if not path.is_relative_to(room.temporary)}
     more = {"edits": [click(masks[-1])], "version": ""}
     for name in CRAFTED:
@@ -187,8 +194,8 @@ def test_a_request_names_nothing_but_what_is_listed(room):
     assert {path for path in outside.rglob("*") if not path.is_relative_to(room.temporary)} == before
 
 
-def test_links_out_of_the_folder_are_not_followed(room, tmp_path):
-    room, _ = room
+def test_links_out_of_the_folder_are_not_followed(copy, tmp_path):
+    room, _ = copy
     secret = capture(tmp_path / "secret", 1, 2, SIZE)
     (room.root / "linked").symlink_to(secret, target_is_directory=True)
     with pytest.raises(ValueError, match="a link that leads out of"):
@@ -200,10 +207,10 @@ def test_links_out_of_the_folder_are_not_followed(room, tmp_path):
     assert "a link that leads out of" in states["train/linked"]
 
 
-def test_photos_that_cannot_be_shown_are_told(room):
-    room, _ = room
+def test_photos_that_cannot_be_shown_are_told(copy):
+    room, _ = copy
     Image.new("RGB", (100, 100)).save(room.root / "hall" / "4.png")
-    with pytest.raises(ValueError, match=r"4\.png: 100x100, and the first photo is 320x240"):
+    with pytest.raises(ValueError, match=r"4\.png: 100x100, and the first photo is 240x180"):
         room.open({"group": "train/hall"})
     (room.root / "hall" / "4.png").write_bytes(b"")
     with pytest.raises(ValueError, match=r"4\.png: not a readable image"):
@@ -233,15 +240,15 @@ def test_a_clip_gets_its_mask_beside_it(tmp_path):
 def test_progress_is_told_while_a_group_is_opened(room, monkeypatch):
     room, _ = room
     waits, goes = threading.Event(), threading.Event()
-    real = room._look
+    view = room._views["train/hall"]
 
-    def slow(*args):
-        room._said["train/hall"] = lambda: "comparing the photos (1 of 4)"
+    def slow(folder, split, root, temporary, method, say):
+        say(lambda: "comparing the photos (1 of 4)")
         waits.set()
         goes.wait(20)
-        return real(*args)
+        return view
 
-    monkeypatch.setattr(room, "_look", slow)
+    monkeypatch.setattr("gift_peft.studio.mask_room.look_at", slow)
     opening = threading.Thread(target=room.open, args=[{"group": "train/hall"}])
     opening.start()
     waits.wait(20)

@@ -182,6 +182,7 @@ def serve(blocks: Any, port: int, folder: Path, opened: bool, ready: Callable[[s
     except KeyboardInterrupt:
         pass
     finally:
+        blocks.server.force_exit = True  # uvicorn would wait for open tabs
         blocks.close(verbose=False)
 
 

@@ -44,14 +44,15 @@ def studio(*words):
     """The address of a studio at work; at its end it has left no temporary folder."""
     settings = {"HF_HUB_OFFLINE": "1", "PYTHONUNBUFFERED": "1", "GRADIO_SHARE": "True", "GRADIO_ALLOWED_PATHS": "/"}
     command = [sys.executable, "-m", "gift_peft", "studio", "--port", "0", *map(str, words)]
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | settings)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    server = subprocess.Popen(command, text=True, env=os.environ | settings, **pipes)
     try:
         line = server.stdout.readline()
         yield re.search(r"http://127\.0\.0\.1:\d+", line).group()
     finally:
         server.send_signal(signal.SIGINT)
-        server.wait(60)
-    assert server.returncode == 0
+        told = server.communicate(timeout=60)[1]
+    assert server.returncode == 0 and "Traceback" not in told and told.startswith("Opening the studio"), told
 
 
 @pytest.fixture(scope="module")
@@ -207,6 +208,7 @@ def test_tabs_reloads_and_the_keyboard_alone(browser, tmp_path):
         first.said("^Click")
         first.page.locator("#masks .for").select_option("3.png")
         first.said("for 3.png alone")
+        first.page.locator("#masks canvas").focus()
         first.page.keyboard.press("x")
         first.said("not saved")
         first.page.keyboard.press("s")

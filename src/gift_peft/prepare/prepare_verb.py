@@ -75,8 +75,8 @@ def _tell_masks(groups: list[dict], raw: str, out: str) -> None:
     drawing = shlex.join(["gift-peft", "studio", raw])
     one = len(lacking) == 1
     print(
-        f"{'A group lacks' if one else f'{len(lacking)} groups lack'} masks: draw them in a browser with `{drawing}`, or "
-        f"`{proposing}` draws first ones; "
+        f"{'A group lacks' if one else f'{len(lacking)} groups lack'} masks: draw them in a browser with `{drawing}`, "
+        f"or `{proposing}` draws first ones; "
         "one mask for a group is enough, as mask.png beside its photos (docs/masks.md)"
     )
 

@@ -5,6 +5,7 @@ another site's page makes, and a Content-Security-Policy tells the browser the s
 rooms put into a temporary folder of this run.
 """
 
+import logging
 import os
 import signal
 import socket
@@ -182,7 +183,8 @@ def serve(blocks: Any, port: int, folder: Path, opened: bool, ready: Callable[[s
     except KeyboardInterrupt:
         pass
     finally:
-        blocks.server.force_exit = True  # uvicorn would wait for open tabs
+        logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)  # that tabs are open is no error
+        blocks.server.config.timeout_graceful_shutdown = 1  # second; else uvicorn waits until they are closed
         blocks.close(verbose=False)
 
 

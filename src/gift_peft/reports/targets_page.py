@@ -87,8 +87,9 @@ def _shown(group: GroupPictures, index: int, kind: str) -> Shown:
         difference = float(np.median(np.abs(moved))) / spread
         told = f"moved by {difference:.1%} in the median, nearer on {nearer:.0%} of the target"
     reference = None if group.reference_proxy is None else group.reference_proxy.numpy()
+    other = ~mask & valid & (base > 0)  # `align` takes no others
     if reference is not None:
-        other = ~mask & valid & (reference != UNKNOWN) & (base > 0)  # of which `align` takes no others
+        other &= reference != UNKNOWN
     if reference is not None and region.any() and spread > 0 and other.any() and np.ptp(reference[other]) > 0:
         reference = np.asarray(align(reference, base, other, "native", kind).aligned)
         maps["treated reference"] = reference

@@ -326,6 +326,7 @@ def test_what_is_refused():
         ((values, mask.astype(float)), "mask is float64"),
         ((values[0], mask[0]), r"\(N,H,W\)"),
         ((values, mask[:1]), r"\(N,H,W\)"),
+        ((values[:0], mask[:0]), "none empty"),
     ):
         for function in (surface_target, plane_surface, align_observations):
             with pytest.raises(ValueError, match=message):
@@ -343,6 +344,8 @@ def test_what_is_refused():
             surface_target(values, mask, **options)
     with pytest.raises(ValueError, match="every mask is empty"):
         surface_target(values, ~(mask | True))
+    with pytest.raises(ValueError, match="none empty"):
+        quantile_surface(values[:0], mask[:0], 0.8)
 
 
 # ---- fills ----

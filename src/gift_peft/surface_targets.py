@@ -365,8 +365,8 @@ def _arrays(
     for name, region in checked:
         if region.dtype != bool:
             raise ValueError(f"{name} is {region.dtype}; it is bool")
-        if array.ndim != 3 or region.shape != array.shape:
-            raise ValueError(f"predictions {array.shape} and {name} {region.shape}: both are (N,H,W)")
+        if array.ndim != 3 or not array.size or region.shape != array.shape:
+            raise ValueError(f"predictions {array.shape} and {name} {region.shape}: both are (N,H,W), none empty")
     region = checked[-1][1] if valid is not None else (np.ones_like(inside) if everywhere else inside)
     for number, (own, there) in enumerate(zip(array, region, strict=True)):
         if not np.isfinite(own[there]).all():

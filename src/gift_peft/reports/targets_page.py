@@ -81,7 +81,9 @@ def _shown(group: GroupPictures, index: int, kind: str) -> Shown:
     region, spread = mask & valid, float(np.subtract(*np.percentile(base[valid], (95, 5)))) if valid.any() else 0.0
     maps, told = {"the base": base, "surface target": target}, "no target at this size"
     difference = 0.0
-    if region.any() and spread > 0:
+    if region.any() and not spread:
+        told = "the base says one depth for the whole photo"
+    elif region.any():
         moved = (target - base)[region]
         nearer = np.mean(moved > 0 if kind == "inverse_depth" else moved < 0)
         difference = float(np.median(np.abs(moved))) / spread

@@ -133,6 +133,15 @@ def test_the_groups_mask_says_which_photos_keep_their_own(room):
     assert [mask is None for mask in decoded.masks] == [True, True, True, False]
 
 
+def test_a_mask_in_which_nothing_changes_is_doubted(room):
+    room, masks = room
+    about = {"group": "train/hall"}
+    assert not room.draw({**about, "edits": [click(masks[-1])]})["still"]
+    beside = {"tool": "brush", "points": [[0.02, 0.02], [0.02, 0.98]], "size": 0.03, "target": True}
+    assert not masks[-1][:, :10].any() and room.draw({**about, "edits": [beside]})["still"]
+    assert not room.draw({**about, "edits": [{"tool": "clear"}]})["still"]
+
+
 def test_two_tabs_do_not_overwrite_each_other(room):
     room, masks = room
     group = {"group": "train/hall"}

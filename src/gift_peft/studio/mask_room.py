@@ -29,6 +29,7 @@ from gift_peft.studio.mask_files import Changed, MaskPlace, frame_place, group_p
 KEPT = 2  # groups whose photos stay in memory
 THUMBNAIL = 320  # pixels across
 TEAL, LINE = (0, 200, 190, 110), (255, 255, 255, 255)  # of the mask's area and border
+STILL = 0.1  # share of a mask that changes in the group, below which it is told
 MOST_CHANGE = 4.0  # times the noise: where the heat map is brightest
 
 
@@ -103,10 +104,15 @@ class MaskRoom:
         return {"overlay": overlay_uri(mask, view), "area": float(mask.mean()), **state}
 
     def draw(self, request: dict) -> dict:
-        """What the saved mask becomes by `edits`: `overlay`, and `area`, its share of the photo."""
+        """What the saved mask becomes by `edits`: `overlay`, `area`, its share of the photo, and `still`: whether
+        hardly anything changes in it, so that it may be no mirror or glass."""
         name, view, index = self._view(request)
         mask = self._drawn(name, view, index, check_edits(request.get("edits")))
-        return {"overlay": overlay_uri(mask, view), "area": float(mask.mean())}
+        judged = view.view(index)
+        inside = cv2.resize(mask.astype(np.uint8), judged.change.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        changes = float((judged.change[inside] > judged.noise).mean()) if inside.any() else 1.0
+        still = bool(judged.change.any()) and changes < STILL
+        return {"overlay": overlay_uri(mask, view), "area": float(mask.mean()), "still": still}
 
     def save(self, request: dict) -> dict:
         """Keep what `edits` make of the mask of `version`: of the group, or of `photo`.

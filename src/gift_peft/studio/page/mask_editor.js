@@ -143,7 +143,8 @@ async function draw() {
   const answer = await ask("draw", { edits: room.edits, ...about() });
   if (asked !== room.asked || answer.error || group !== room.group || own !== room.own) return;
   $(".overlay").src = answer.overlay;
-  say(`${(100 * answer.area).toFixed(1)} % of the photo, not saved yet.`);
+  const doubt = answer.still ? " Hardly anything changes there: is it the mirror or glass? The heat map (H) shows what changes." : "";
+  say(`${(100 * answer.area).toFixed(1)} % of the photo, not saved yet.${doubt}`);
   strip();
 }
 

@@ -1,0 +1,142 @@
+"""How much blurrier a camera sees the same scene than it did before, in pixels of a Gaussian.
+
+A number of how sharp one picture is depends on what it shows, on noise and on the codec. Here the earlier picture
+itself is blurred by known amounts, and the contrast that its fine detail then keeps, place by place, is compared with
+what the later picture has left of it. Contrast is measured by correlation with the earlier picture, so noise does not
+count, relative to a coarser band, so the light does not; places that show something else do not correlate.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+SIDE = 1280  # pixels of the longer side at most
+PLACES = 32  # along the longer side
+FINE, COARSE = (1.0, 2.2), (2.2, 5.0)  # of each band, as differences of Gaussians
+TRIALS = (0.0, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5)  # pixels of blur
+CORRELATION = 0.9  # of the coarser band, from which a place shows the same
+LEAST_DETAIL = 0.5  # grey levels of the fine band, from which a place counts; and its noise's, times
+OVER_NOISE = 1.5
+LEAST_PLACES, LEAST_ALIKE = 8, 0.15  # and share of those with detail that must show the same
+LOST = 0.25  # fine contrast, below which a picture that is like the earlier one nowhere is out of focus
+SHRUNK = 4  # times smaller is the second resolution
+
+
+@dataclass(frozen=True)
+class Blur:
+    """Against the earlier picture.
+
+    Args:
+        pixels (`float`): standard deviation of the Gaussian that was added; 0 if it is as sharp, or sharper.
+        sharpness (`float`): contrast of fine detail that is left; 1 is as sharp, above 1 is sharper.
+    """
+
+    pixels: float
+    sharpness: float
+
+
+class Focus:
+    """An earlier picture, to which later ones are compared.
+
+    Args:
+        first, second (`np.ndarray`): (H, W) float32, grey levels: means of some frames, and of others that show the
+            same. Noise that they do not share counts nowhere.
+        mask (`np.ndarray`, *optional*): (H, W) bool, the target, which does not count.
+    """
+
+    def __init__(self, first: np.ndarray, second: np.ndarray, mask: np.ndarray | None = None) -> None:
+        self.size = first.shape[1], first.shape[0]
+        scale = min(1.0, SIDE / max(self.size))
+        self.levels = [_Level(first, second, mask, scale / smaller) for smaller in (1, SHRUNK)]
+
+    def blur(self, gray: np.ndarray, matrix: np.ndarray | None = None) -> Blur | None:
+        """What a later picture (H, W) float32 of the same camera has lost; None if too little shows the same.
+
+        `matrix` (3, 3) is the camera's motion, the earlier picture's pixels to this one's.
+        """
+        if matrix is not None:
+            flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP  # cubic: linear would blur
+            gray = cv2.warpPerspective(gray, matrix, self.size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        # A strong blur leaves nothing to compare at the finer resolution, and a very strong one at none.
+        for level in self.levels:
+            if (blur := level.blur(gray)) is not None:
+                return blur
+        left = self.levels[0].detail_left(gray)
+        return None if left is None or left > LOST else Blur(TRIALS[-1] / self.levels[-1].scale, left)
+
+
+class _Level:
+    """The earlier picture at one resolution."""
+
+    def __init__(self, first: np.ndarray, second: np.ndarray, mask: np.ndarray | None, scale: float) -> None:
+        self.scale = scale
+        first, second = self._small(first), self._small(second)
+        small = (first + second) / 2
+        height, width = small.shape
+        larger = max(height, width)
+        self.places = max(1, round(PLACES * width / larger)), max(1, round(PLACES * height / larger))
+        self.fine, self.coarse = _band(small, FINE), _band(small, COARSE)
+        usable = (small > 6) & (small < 246)
+        if mask is not None:
+            usable &= self._small(mask.astype(np.float32)) == 0
+        margin = np.ones((2 * round(COARSE[1]) + 1,) * 2, np.uint8)
+        self.usable = cv2.erode(usable.astype(np.uint8), margin).astype(np.float32)
+        one, other, low, low_other = (_band(half, sigmas) for sigmas in (FINE, COARSE) for half in (first, second))
+        self.energy, self.low_energy = self._mean(one * other), self._mean(low * low_other)
+        noise = self._mean(np.square(one - other)) / 4
+        self.telling = self.energy > np.maximum(LEAST_DETAIL**2, OVER_NOISE**2 * noise)
+        blurred = [(cv2.GaussianBlur(second, (0, 0), trial) if trial else second) for trial in TRIALS]
+        self.kept = np.stack([self._contrasts(half, one, low)[0] for half in blurred])
+
+    def blur(self, gray: np.ndarray) -> Blur | None:
+        left, alike = self._contrasts(self._small(gray), self.fine, self.coarse)
+        places = self.telling & alike
+        if places.sum() < LEAST_PLACES or alike[self.telling].mean() < LEAST_ALIKE:
+            return None
+        weights = np.square(self.energy[places])  # strong edges: codecs smooth what is faint
+        apart = [_weighted_median((left - kept)[places], weights) for kept in self.kept]
+        sharpness = 1 + apart[0]
+        if apart[0] >= 0:
+            return Blur(0.0, sharpness)
+        # How much too little contrast is left falls with the blur that is tried; between two trials, by the line.
+        after = next((index for index, value in enumerate(apart) if value >= 0), None)
+        if after is None:
+            return Blur(TRIALS[-1] / self.scale, sharpness)
+        low, high = apart[after - 1], apart[after]
+        share = -low / max(high - low, 1e-9)
+        pixels = TRIALS[after - 1] + share * (TRIALS[after] - TRIALS[after - 1])
+        return Blur(float(pixels) / self.scale, sharpness)
+
+    def detail_left(self, gray: np.ndarray) -> float | None:
+        """Fine contrast over the earlier picture's, where that has some, whatever is shown; None if it has none."""
+        if self.telling.sum() < LEAST_PLACES:
+            return None
+        here = self._mean(np.square(_band(self._small(gray), FINE)))
+        return float(np.sqrt(here[self.telling].sum() / self.energy[self.telling].sum()))
+
+    def _contrasts(self, small: np.ndarray, goal: np.ndarray, low_goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of each place: the fine contrast that is left, relative to the coarser one; whether it shows the same."""
+        fine, coarse = _band(small, FINE), _band(small, COARSE)
+        both = self._mean(low_goal * coarse)
+        alike = both > CORRELATION * np.sqrt(np.maximum(self.low_energy, 0) * self._mean(coarse * coarse)) + 1e-6
+        fine_left = self._mean(goal * fine) / np.maximum(self.energy, 1e-6)
+        return fine_left * self.low_energy / np.where(alike, both, np.inf), alike
+
+    def _mean(self, image: np.ndarray) -> np.ndarray:
+        return cv2.resize(image * self.usable, self.places, interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
+
+    def _small(self, picture: np.ndarray) -> np.ndarray:
+        size = tuple(max(1, round(side * self.scale)) for side in picture.shape[::-1])
+        return picture if self.scale == 1 else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
+def _band(image: np.ndarray, sigmas: tuple[float, float]) -> np.ndarray:
+    narrow, wide = (cv2.GaussianBlur(image, (0, 0), sigma) for sigma in sigmas)
+    return narrow - wide
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gift_peft.captures.clip import ClipFrame
+from gift_peft.captures.clip import ClipFrame, open_quietly
 
 if TYPE_CHECKING:
     import cv2
@@ -48,7 +48,7 @@ def _open(device: int | str, called: str) -> "cv2.VideoCapture":
     level = log.getLogLevel()
     log.setLogLevel(log.LOG_LEVEL_SILENT)  # else OpenCV writes a line of its own for each driver that it tries
     try:
-        capture = cv2.VideoCapture(device) if isinstance(device, int) else cv2.VideoCapture(device, cv2.CAP_FFMPEG)
+        capture = cv2.VideoCapture(device) if isinstance(device, int) else open_quietly(device)
     finally:
         log.setLogLevel(level)
     if not capture.isOpened():

@@ -13,13 +13,14 @@ import numpy as np
 
 SIDE = 1280  # pixels of the longer side at most
 PLACES = 32  # along the longer side
+LEAST_SIDE = 10  # pixels of a place, else chance makes pictures alike
 FINE, COARSE = (1.0, 2.2), (2.2, 5.0)  # of each band, as differences of Gaussians
 TRIALS = (0.0, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5)  # pixels of blur
 CORRELATION = 0.9  # of the coarser band, from which a place shows the same
 LEAST_DETAIL = 0.5  # grey levels of the fine band, from which a place counts; and its noise's, times
 OVER_NOISE = 1.5
 LEAST_PLACES, LEAST_ALIKE = 8, 0.15  # and share of those with detail that must show the same
-LOST = 0.25  # fine contrast, below which a picture that is like the earlier one nowhere is out of focus
+LOST = 0.4  # fine contrast, below which a picture that is like the earlier one nowhere is out of focus
 SHRUNK = 4  # times smaller is the second resolution
 
 
@@ -59,11 +60,14 @@ class Focus:
             flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP  # cubic: linear would blur
             gray = cv2.warpPerspective(gray, matrix, self.size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         # A strong blur leaves nothing to compare at the finer resolution, and a very strong one at none.
-        for level in self.levels:
-            if (blur := level.blur(gray)) is not None:
-                return blur
-        left = self.levels[0].detail_left(gray)
-        return None if left is None or left > LOST else Blur(TRIALS[-1] / self.levels[-1].scale, left)
+        fine, shrunk = self.levels
+        if (blur := fine.blur(gray)) is not None:
+            return blur
+        left = fine.detail_left(gray)
+        if left is None or left > LOST:
+            return None
+        blur = shrunk.blur(gray)
+        return Blur(TRIALS[-1] / shrunk.scale if blur is None else blur.pixels, left)
 
 
 class _Level:
@@ -75,7 +79,8 @@ class _Level:
         small = (first + second) / 2
         height, width = small.shape
         larger = max(height, width)
-        self.places = max(1, round(PLACES * width / larger)), max(1, round(PLACES * height / larger))
+        places = min(PLACES, larger / LEAST_SIDE)
+        self.places = max(1, round(places * width / larger)), max(1, round(places * height / larger))
         self.fine, self.coarse = _band(small, FINE), _band(small, COARSE)
         usable = (small > 6) & (small < 246)
         if mask is not None:

@@ -44,6 +44,10 @@ class _Fit:
     agreeing: float
 
 
+def _agreeing(fit: _Fit) -> float:
+    return fit.agreeing
+
+
 class _Level:
     """The anchor's structure at one resolution."""
 
@@ -140,8 +144,9 @@ class Anchor:
         coarse, fine = self.levels
         near = _quarter(there)
         fits = [coarse.fit(near, start, STEPS) for start in self._starts(near)]
-        best = max(fits, key=lambda fit: fit.agreeing)
-        fit = fine.fit(there, best.shift * COARSE, STEPS)
+        best = max(fits, key=_agreeing).shift * COARSE
+        starts = [best, np.zeros(4)] if np.abs(best).max() > 1 else [best]  # a large target misleads at low resolution
+        fit = max((fine.fit(there, start, STEPS) for start in starts), key=_agreeing)
         if not np.isfinite(fit.shift).all() or fit.agreeing < AGREEING:
             return None
         return self._whole(fit)

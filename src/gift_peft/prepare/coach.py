@@ -30,7 +30,8 @@ from gift_peft.prepare.stillness import (
 
 EVERY = 0.19  # seconds between two measurements of a still scene
 FRAMES = 4  # that each of the two running means reaches back over
-BLURRED, LESS_SHARP = 1.25, 0.93  # pixels of blur, of a picture of at most SIDE; and the fine contrast that is left
+LEAST_PUSH = 1.5  # pixels
+BLURRED, LESS_SHARP = 1.25, 0.96  # pixels of blur, of a picture of at most SIDE; and the fine contrast that is left
 WHITE, BLACK = 250, 3  # grey levels
 MAX_WHITE, MAX_BLACK = 0.10, 0.30  # share of the first photo's pixels
 MORE_CLIPPED, IN_BRIGHTER = 0.03, 1.08  # share that has become white (black) since; and the light that it takes
@@ -225,7 +226,7 @@ class Coach:
             share = float((changed if self.outside is None else changed[self.outside]).mean())
             return [Remark("moved", "the camera shows another view: put it back")] if share > STRUCTURE_CHANGED else []
         height, width = self._means.gray.shape
-        if motion.pixels <= max(1.0, MOVED * float(np.hypot(width, height)), SURE * motion.error):
+        if motion.pixels <= max(LEAST_PUSH, MOVED * float(np.hypot(width, height)), SURE * motion.error):
             return []
         self._moved = motion
         return [Remark("moved", f"the camera moved by {motion.pixels:.1f} px; put it back, or let it stand")]

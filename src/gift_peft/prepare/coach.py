@@ -41,7 +41,7 @@ LEAST_OUTSIDE = 30  # cells, from which they are a control
 TAIL_OF_MEDIAN, MAX_CONTROL = 5.0, 3.0  # 99 of 100 cells stay below so many medians; grey levels
 BLINK = 0.35  # seconds of restlessness that are a codec's or a flicker's, and no change of the scene
 SAME_AGAIN = 0.8  # seconds of stillness after something was changed, from which nothing new has come of it
-NOTHING_COMES = 2.5  # seconds of stillness after a photo, or after the last change, without anything new
+NOTHING_COMES = 2.0  # seconds of stillness after a photo, or after the last change, without anything new
 TOLD_LONG_ENOUGH = 2.0  # seconds, after which a camera stands where it was moved to, and a doubtful photo is taken
 ENOUGH_PHOTOS, ENOUGH_OLD = 3, 3  # photos at least, and changes in a row that showed nothing new
 SPOILING = ("moved", "blurred", "over_exposed", "under_exposed")  # no photo is taken
@@ -139,6 +139,7 @@ class Coach:
         self._stirred = False  # something was changed since the last photo
         self._since: dict[str, float] = {}  # when each of the present warnings was told first
         self._moved: Motion | None = None
+        self._moved_since: float | None = None  # which lasts through what moves in between
         self._light, self._light_at = 1.0, 0.0
 
     def ask_reference(self) -> None:
@@ -164,7 +165,7 @@ class Coach:
         if not self.watch.still or moment is None:
             if seconds - self._last_still > BLINK:
                 self._nothing_new = None
-                self._say(seconds, [item for item in self._wrong if item.code in ("moved", "blurred")])
+                self._say(seconds, [])
             return self._advice
         if seconds - self._last_still > BLINK:
             self._still_since, self._stirred = seconds, True
@@ -203,7 +204,7 @@ class Coach:
             return [Remark("under_exposed", f"under-exposed: {black}, and it was {group.dark:.0%}; lock the exposure")]
         found = self._judge_light(seconds, gain)
         motion = group.anchor.motion(np.clip(np.round(gray), 0, 255).astype(np.uint8))
-        found += self._judge_motion(motion, cells)
+        found += self._judge_motion(seconds, motion, cells)
         if not any(item.code == "moved" for item in found):
             found += self._judge_focus(gray, motion)
         return found
@@ -218,17 +219,20 @@ class Coach:
             return []
         return [Remark("exposure_changed", f"the exposure changed by a factor of {step:.2f}; lock it")]
 
-    def _judge_motion(self, motion: Motion | None, cells: np.ndarray) -> list[Remark]:
-        self._moved = None
+    def _judge_motion(self, seconds: float, motion: Motion | None, cells: np.ndarray) -> list[Remark]:
+        self._moved, since, self._moved_since = None, self._moved_since, None
         self._advice = replace(self._advice, drift=None if motion is None else motion.pixels)
         if motion is None:
             changed = difference(cells, self.group.cells[0], self.outside) > 2 * OTHER_CONTENT
             share = float((changed if self.outside is None else changed[self.outside]).mean())
-            return [Remark("moved", "the camera shows another view: put it back")] if share > STRUCTURE_CHANGED else []
+            if share <= STRUCTURE_CHANGED:
+                return []
+            self._moved_since = seconds if since is None else since
+            return [Remark("moved", "the camera shows another view: put it back")]
         height, width = self._means.gray.shape
         if motion.pixels <= max(LEAST_PUSH, MOVED * float(np.hypot(width, height)), SURE * motion.error):
             return []
-        self._moved = motion
+        self._moved, self._moved_since = motion, seconds if since is None else since
         return [Remark("moved", f"the camera moved by {motion.pixels:.1f} px; put it back, or let it stand")]
 
     def _judge_focus(self, gray: np.ndarray, motion: Motion | None) -> list[Remark]:
@@ -247,7 +251,7 @@ class Coach:
         """A photo, a new group, or a word that nothing new shows."""
         if "moved" in self._advice.codes:
             known = self._moved is not None or self.mask is None  # else the mask cannot be carried along
-            if known and (self.wanted == "photo" or self._told_for(seconds, "moved") > TOLD_LONG_ENOUGH):
+            if known and (self.wanted == "photo" or seconds - self._moved_since > TOLD_LONG_ENOUGH):
                 self._begin_group()
             return
         ready = moment.best is not None and seconds - moment.start >= QUIET
@@ -304,7 +308,7 @@ class Coach:
         if self.mask is not None:
             self.inside, self.outside = cells_inside(self.mask_here)
         self.group = _Group()
-        self._wrong, self._nothing_new, self._since = [], None, {}
+        self._wrong, self._nothing_new, self._since, self._moved_since = [], None, {}, None
         self._advice = Advice(still=True, new_group=True)
         self._restart()
 

@@ -6,7 +6,7 @@ is chosen by `prepare/clip_frames.py`.
 
 import os
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,7 +63,7 @@ class Clip:
         self.rate = rate if 0 < rate < 1000 else 30.0
         capture.release()
 
-    def frames(self, wanted: Iterable[int] | None = None) -> Iterator[ClipFrame]:
+    def frames(self, wanted: Iterable[int] | None = None) -> Generator[ClipFrame, None, None]:
         """All frames in order, or only those of these numbers; the others are then decoded, but not converted.
 
         The clip ends where no frame can be decoded any more. ValueError naming it: not even one can be.

@@ -5,7 +5,7 @@ A thread reads all the time, so that whoever looks at frames more slowly than th
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +19,7 @@ SILENCE = 3.0  # seconds without a picture, after which a camera or stream count
 FIRST_PICTURE = 10.0  # seconds that it may take to the first one
 
 
-def live_frames(device: int | str) -> Iterator[ClipFrame]:
+def live_frames(device: int | str) -> Generator[ClipFrame, None, None]:
     """The newest frames of a camera (its number) or a stream (its address), with seconds since the first; ends where
     no more come.
 

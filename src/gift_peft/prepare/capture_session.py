@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,7 @@ class Source:
     clip: Clip | None = None
     device: int | str = 0
 
-    def frames(self) -> Iterator[ClipFrame]:
+    def frames(self) -> Generator[ClipFrame, None, None]:
         """Frames with their times. ValueError: nothing can be read."""
         return live_frames(self.device) if self.clip is None else self.clip.frames()
 

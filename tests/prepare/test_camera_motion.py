@@ -43,5 +43,7 @@ def test_turn_and_zoom_are_in_pixels_of_the_frame(size):
 def test_another_view_and_an_empty_one_have_no_motion():
     anchor = Anchor(noisy(scene(1, SIZE), 0))
     assert anchor.motion(noisy(scene(2, SIZE), 1)) is None
+    small = scene(1, (32, 320))
+    assert Anchor(small).motion(small) is None
     assert anchor.motion(np.full((*SIZE, 3), 90, np.uint8)) is None
     assert Anchor(np.full((*SIZE, 3), 90, np.uint8)).motion(noisy(scene(2, SIZE), 1)) is None

@@ -15,6 +15,7 @@ from gift_peft.prepare.homography import normalize_contrast, transform
 SIDE = 640  # pixels of the longer side, at which it is measured
 TILES = 16  # along the longer side
 COARSE, STEPS = 4, 12  # first at a quarter of the resolution; Gauss-Newton steps at most at each
+LEAST_SIDE = 16  # pixels of the shorter side at the coarse resolution
 MAX_STEP, SETTLED = 4.0, 0.01  # pixels at that resolution
 AGREEING = 0.3  # correlation of the tiles after the motion, on average by the energy of their gradients
 SURE = 3.0  # times its own expected error, by which a motion exceeds 0
@@ -140,6 +141,8 @@ class Anchor:
 
     def motion(self, pixels: np.ndarray) -> Motion | None:
         """How the camera has moved, or None if that cannot be seen: too little structure, or another view."""
+        if min(self.levels[0].image.shape) < LEAST_SIDE:
+            return None
         there = _structure(self._small(pixels))
         coarse, fine = self.levels
         near = _quarter(there)

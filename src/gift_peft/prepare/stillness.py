@@ -12,6 +12,7 @@ CELLS, LEAST_SIDE = 96, 8  # cells along the longer side; pixels of a cell at le
 MIN_CHANGE, MAX_CHANGE = 1.2, 6.0  # grey levels; bounds of what counts as a change from one moment to the next
 OTHER_CONTENT = 3.0  # grey levels; moments further apart also differ by what the light does to shadows
 NOISES = 1.9  # a change exceeds the noise this many times
+ONE_GAIN = 0.06  # of the logarithm; gains that differ by less are one
 STRUCTURE_CHANGED = 0.6  # share of the cells that changed, above which it is another view
 
 
@@ -62,11 +63,19 @@ def same_light(cells: np.ndarray, goal: np.ndarray, region: np.ndarray | None = 
 
 
 def light_gain(cells: np.ndarray, goal: np.ndarray, region: np.ndarray | None = None) -> float:
-    """By what the brightness of `cells` is multiplied to give that of `goal`, both (h, w, 3): the median of cells."""
+    """What the brightness of `cells` is multiplied by to give that of `goal`, both (h, w, 3), as most cells agree.
+
+    Cells that show something else have any gain, and a change of the light is one gain for all the others.
+    """
     chosen = slice(None) if region is None or region.sum() < 30 else region
     here, there = cells[chosen].ravel(), goal[chosen].ravel()
     usable = (here > 8) & (here < 245) & (there > 8) & (there < 245)
-    return float(np.median(there[usable] / here[usable])) if usable.sum() >= 30 else 1.0
+    if usable.sum() < 30:
+        return 1.0
+    gains = np.sort(np.log(there[usable] / here[usable]))
+    ends = np.searchsorted(gains, gains + ONE_GAIN, side="right")
+    first = int(np.argmax(ends - np.arange(len(gains))))
+    return float(np.exp(np.median(gains[first : ends[first]])))
 
 
 def difference(cells: np.ndarray, goal: np.ndarray, region: np.ndarray | None = None) -> np.ndarray:

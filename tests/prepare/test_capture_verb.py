@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 
 import cv2
@@ -68,6 +70,15 @@ def test_what_gives_no_photo_is_one_line(tmp_path, capsys, monkeypatch, source, 
     said = capsys.readouterr().err.strip().splitlines()
     assert message in said[-1] and said[-1].startswith("gift-peft: error:") and len(said) == 1
     assert not (tmp_path / "raw").exists()
+
+
+@pytest.mark.parametrize("source", ["99", "http://127.0.0.1:9/x"])
+def test_no_camera_is_one_line_for_whoever_looks_at_the_terminal(tmp_path, source):
+    """In a process of its own: OpenCV and FFmpeg write to stderr past Python."""
+    command = [sys.executable, "-m", "gift_peft", "capture", source, str(tmp_path / "raw")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1 and done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1 and f"{source}: cannot be opened" in done.stderr
 
 
 def still_clip(path, pictures, seconds=1.2):

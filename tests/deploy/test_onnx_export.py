@@ -234,3 +234,7 @@ def test_an_operation_that_cannot_be_exported_is_named():
         exported_program(Sorts(), 14, False, "sorter")
     error = RuntimeError("No decomposition for aten.frobnicate.default\nmore")
     assert failed_operation(error).startswith("aten.frobnicate")
+    try:  # as torch.onnx wraps what it could not translate
+        raise RuntimeError("step 3/3. Next steps:\n- implement it\n## Exception summary\n") from KeyError("no round")
+    except RuntimeError as wrapped:
+        assert "no round" in failed_operation(wrapped) and "Next steps" not in failed_operation(wrapped)

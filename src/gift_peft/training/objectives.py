@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import gather_object
 from tqdm import tqdm
 
 from gift_peft.dataset.loader import PreparedGroups, PreparedImages, epoch_flips, epoch_order, read_ahead
@@ -23,6 +22,7 @@ from gift_peft.losses import gift_terms, masked_l1
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.mask_checks import check_surroundings, warn_of_masks
 from gift_peft.training.schedule import updates_after
+from gift_peft.training.shares import failing_together, in_order, own_share
 from gift_peft.training.speed import checkpoint_blocks
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
@@ -240,20 +240,12 @@ def look_at_all(
     quiet: bool,
 ) -> list[Losses]:
     """`look` of every group once, in their order, shared by the processes; the first ValueError is raised in all."""
-    mine = range(accelerator.process_index, len(groups), accelerator.num_processes)
+    mine, found = own_share(len(groups), accelerator), []
     bar = {"total": len(mine), "desc": "first look", "unit": "group", "delay": 2, "disable": quiet}
-    found, problem = [], None
-    try:
+    with failing_together(accelerator):
         for index, item in zip(mine, tqdm(read_ahead(read, mine, groups.num_threads), **bar), strict=True):
             found.append((index, look(item)))
-    except (ValueError, OSError) as error:
-        problem = error
-    if accelerator.num_processes > 1:
-        problem = next((each for each in gather_object([problem]) if each is not None), None)
-        found = sorted(gather_object(found), key=lambda pair: pair[0])
-    if problem is not None:
-        raise problem
-    return [losses for _, several in found for losses in several]
+    return [losses for several in in_order(found, accelerator) for losses in several]
 
 
 OBJECTIVES = {"consensus": Consensus, "surface": Surface}

@@ -32,7 +32,7 @@ def decoded(monkeypatch):
 def test_a_restart_decodes_nothing(base_dir, tmp_path, decoded, target):
     raw = write_raw_tree(tmp_path / "raw")
     options = {"target": "surface", "fills": 1} if target == "surface" else {}
-    args = arguments(base_dir, raw, tmp_path / "whole", **options)
+    args = arguments(base_dir, raw, tmp_path / "whole", group_cache_dir=str(tmp_path / "groups"), **options)
     train(args)
     # Once for the proxies, once at network size.
     assert decoded.keys() == set(map(str, raw.rglob("*.png"))) and set(decoded.values()) == {2}

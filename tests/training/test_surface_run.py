@@ -239,7 +239,6 @@ REFUSED = {
     "surface_model": ({"surface_model": "plane"}, "consensus does not take it"),
     "surface_tau": ({"target": "surface", "surface_tau": 1.0}, "between 0 and 1"),
     "retain": ({"target": "surface", "retain": "0"}, "target: surface does not take it"),
-    "micro_batch_size": ({"target": "surface", "micro_batch_size": 1}, "surface does not take it"),
     "profile": ({"target": "surface", "profile": 2}, "surface does not take it"),
     "target": ({"target": "median"}, "neither consensus nor surface"),
     "warmup_steps": ({"warmup_steps": -1}, "must be finite and not negative"),

@@ -42,6 +42,8 @@ class PreparedGroups:
         pin: into pinned memory, from where tensors travel to a CUDA device while the host goes on.
     """
 
+    unit = "group"
+
     def __init__(
         self,
         dataset,
@@ -52,6 +54,7 @@ class PreparedGroups:
         pin: bool = False,
     ) -> None:
         self.dataset = dataset
+        self.image_names: list[list[str]] = dataset["image_names"][:]
         self.num_threads = num_threads
         self.pin = pin
         self._cache = GroupCache(dataset, processor, size, cache_dir)
@@ -81,7 +84,7 @@ class PreparedGroups:
 
 
 class PreparedImages:
-    """The images of groups, one by one: groups of one, with their surface targets.
+    """The images of groups, one by one: groups of one, with their proxies and surface targets.
 
     Of a group in the cache only this image is read; without a cache each image decodes its whole group.
 
@@ -89,9 +92,12 @@ class PreparedImages:
         groups: of rows with surface targets, as `load_gift_i(..., teacher=..., surface=...)` gives them.
     """
 
+    unit = "image"
+
     def __init__(self, groups: PreparedGroups) -> None:
         self.groups = groups
-        counts = map(len, groups.dataset["image_names"])
+        self.num_threads = groups.num_threads
+        counts = map(len, groups.image_names)
         self._places = [(row, image) for row, count in enumerate(counts) for image in range(count)]
 
     def __len__(self) -> int:
@@ -109,13 +115,13 @@ class PreparedImages:
         if flip:
             image.pixel_values, image.mask = image.pixel_values.flip(-1), image.mask.flip(-1)
             image.valid = None if image.valid is None else image.valid.flip(-1)
-            image.surface_target = image.surface_target_flipped
+            image.surface_target, image.target = image.surface_target_flipped, None
         image.surface_target_flipped = None
         return image
 
     def take(self, items: Iterable[tuple[int, bool]]) -> Iterator[Group]:
         """`read` of these (index, flip), in this order; there may be infinitely many."""
-        return read_ahead(lambda item: self.read(*item), items, self.groups.num_threads)
+        return read_ahead(lambda item: self.read(*item), items, self.num_threads)
 
 
 def read_ahead(read: Callable[[Item], Group], items: Iterable[Item], num_threads: int) -> Iterator[Group]:

@@ -154,7 +154,7 @@ def test_bad_input_is_one_line():
     bad, infinite = pixels.clone(), target.clone()
     bad[2], infinite[1] = math.nan, math.inf
     cases = {
-        "the prediction of g/c.png (image 0) has NaN": (bad, mask, target, valid, names),
+        "the prediction of g/c.png (image 2) has NaN": (bad, mask, target, valid, names),
         "the surface target of g/b.png (image 1) has NaN": (pixels, mask, infinite, valid, names),
         "the prediction is 28x28 but mask and target are 14x28": (pixels, mask[:, :14], target[:, :14], None, names),
         "the loss of this update is NaN or infinite": (pixels, mask, torch.full_like(target, 3e38), valid, names),
@@ -243,4 +243,4 @@ def test_processes_take_the_least_and_measuring_leaves_no_trace(answers):
 
 
 def test_what_one_process_stumbles_over_all_report(answers):
-    assert "the prediction of image 0 has NaN" in answers[0]["bad"] and answers[0]["bad"] == answers[1]["bad"]
+    assert "the prediction of image 1 has NaN" in answers[0]["bad"] and answers[0]["bad"] == answers[1]["bad"]

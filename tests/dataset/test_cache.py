@@ -10,16 +10,14 @@ import pytest
 import torch
 from helpers.tiny import SIZE, tiny_processor, write_group
 from PIL import Image
-from safetensors.torch import load_file
 
 from gift_peft.dataset import cache as module
 from gift_peft.dataset import rows as rows_module
 from gift_peft.dataset.cache import GroupCache
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.loader import PreparedGroups, PreparedImages
-from gift_peft.dataset.proxies import SurfaceSettings, read_header, write_proxies
+from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.dataset.tensors import collate_group
-from gift_peft.rules import UNKNOWN
 from gift_peft.training.teacher import make_proxies
 
 
@@ -188,29 +186,12 @@ def test_an_image_takes_the_memory_of_one_image_whatever_its_group(base_dir, tmp
     assert len(images) == count
     for index in (0, count - 1):
         image = images.read(index)
-        for name in ("pixel_values", "mask", "target", "surface_target"):
+        for name in ("pixel_values", "mask", "surface_target"):
             tensor = getattr(image, name)
             assert torch.equal(tensor[0], getattr(whole, name)[index]), name
             own = tensor.untyped_storage().nbytes() == tensor.element_size() * tensor[0].numel()
             assert own or is_mapped(tensor, tmp_path), name
         assert image.pixel_values.untyped_storage().nbytes() == 12 * SIZE[0] * SIZE[1]
-
-
-def test_what_the_teacher_leaves_out_does_not_exist_for_an_image(base_dir, tmp_path):
-    """Sky, by a teacher with a mask of its own: not in the loss of a surface target either."""
-    write_group(tmp_path / "raw/train/scene", 2, 0)
-    surface = SurfaceSettings(fills=0)
-    made = make_proxies(base_dir, tmp_path / "raw", size=SIZE, surface=surface) / "train/scene.safetensors"
-    proxies = load_file(made)["proxies"]
-    proxies[1, :20, :30] = UNKNOWN
-    write_proxies(made, read_header(made), proxies, None)
-    rows = load_gift_i(tmp_path / "raw", "train", teacher=base_dir, size=SIZE, surface=surface)
-    images = PreparedImages(PreparedGroups(rows, tiny_processor(), SIZE, 0, tmp_path / "cache"))
-    there = torch.ones(SIZE, dtype=torch.bool)
-    there[:20, :30] = False
-    assert images.read(0).valid is None
-    assert torch.equal(images.read(1).valid[0], there)
-    assert torch.equal(images.read(1, flip=True).valid[0], there.flip(-1))
 
 
 def test_threads_that_want_the_same_group_decode_it_once(raw, tmp_path, monkeypatch):

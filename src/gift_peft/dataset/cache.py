@@ -62,7 +62,7 @@ class GroupCache:
         self._locks: dict[int, Lock] = {}
 
     def read(self, index: int, image: int | None = None) -> Group:
-        """The group of one row, without its `pictures`; or one image of it alone.
+        """The group of one row, without its `pictures`; or one image of it, with its surface targets alone.
 
         Raises as reading the row and `collate_group` do.
         """
@@ -76,8 +76,8 @@ class GroupCache:
         if image is not None:  # the arrays are mapped into memory: only this image's pages are read
             part = slice(image, image + 1)
             arrays = {name: arrays[name][part] for name in PICTURES if name in arrays}
-        if self._proxies is not None:
-            proxies = self._proxies.read(group_id, names, digests, part)
+        elif self._proxies is not None:
+            proxies = self._proxies.read(group_id, names, digests)
         if self._surface is not None:
             targets = self._surface.read(group_id, names, digests, part)
         return to_group(group_id, names[part], surface, arrays, proxies, self.processor, self.size, targets)

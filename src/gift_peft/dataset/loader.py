@@ -16,6 +16,7 @@ import torch
 
 from gift_peft.dataset.cache import GroupCache
 from gift_peft.dataset.tensors import Group
+from gift_peft.rules import UNKNOWN
 
 Item = TypeVar("Item")
 
@@ -41,8 +42,6 @@ class PreparedGroups:
         cache_dir: of `GroupCache`; None decodes every time.
         pin: into pinned memory, from where tensors travel to a CUDA device while the host goes on.
     """
-
-    unit = "group"
 
     def __init__(
         self,
@@ -84,15 +83,13 @@ class PreparedGroups:
 
 
 class PreparedImages:
-    """The images of groups, one by one: groups of one, with their proxies and surface targets.
+    """The images of groups, one by one: groups of one, with their surface targets.
 
     Of a group in the cache only this image is read; without a cache each image decodes its whole group.
 
     Args:
         groups: of rows with surface targets, as `load_gift_i(..., teacher=..., surface=...)` gives them.
     """
-
-    unit = "image"
 
     def __init__(self, groups: PreparedGroups) -> None:
         self.groups = groups
@@ -115,8 +112,11 @@ class PreparedImages:
         if flip:
             image.pixel_values, image.mask = image.pixel_values.flip(-1), image.mask.flip(-1)
             image.valid = None if image.valid is None else image.valid.flip(-1)
-            image.surface_target, image.target = image.surface_target_flipped, None
+            image.surface_target = image.surface_target_flipped
         image.surface_target_flipped = None
+        if (unknown := image.surface_target == UNKNOWN).any():  # as with the proxies of whole groups
+            image.valid = ~unknown if image.valid is None else image.valid & ~unknown
+            image.surface_target = image.surface_target.masked_fill(unknown, 0)
         return image
 
     def take(self, items: Iterable[tuple[int, bool]]) -> Iterator[Group]:

@@ -275,17 +275,13 @@ class ProxyStore:
         """Where a file belongs."""
         return Path(self.teacher_folder) / self.size / self.split / file
 
-    def read(
-        self, group_id: str, names: Sequence[str], digests: dict, part: slice = slice(None)
-    ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """(proxies (N, h, w) or of the images in `part`, reference (h, w) or None), float32.
-
-        Of a group with these `picture_digests`.
+    def read(self, group_id: str, names: Sequence[str], digests: dict) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """(proxies (N, h, w), reference (h, w) or None), float32, of a group with these `picture_digests`.
 
         Raises FileNotFoundError for a missing file and ValueError for a stale, damaged or NaN one, naming it and the
         command that makes it again.
         """
-        tensors = self._read(f"{group_id}.safetensors", "proxy", ("proxies",), names, digests, part)
+        tensors = self._read(f"{group_id}.safetensors", "proxy", ("proxies",), names, digests)
         return tensors["proxies"], tensors.get("reference")
 
     def _read(

@@ -107,14 +107,14 @@ class Consensus:
         That needs no forward: the base's predictions are the proxies, its distillation is 0.
         """
 
-        def look(group: Loaded) -> Losses:
+        def look(group: Loaded) -> list[Losses]:
             inputs = group.inputs
             check_surroundings(group.group_id, inputs.mask, inputs.valid)
             warn_of_masks(group.group_id, inputs)
             tensors = (inputs.target, inputs.target, inputs.mask, inputs.pairs)
             with torch.no_grad():
                 loss = gift_terms(*tensors, self.args.lambda_c, self.args.lambda_d, inputs.valid)
-            return Losses(float(loss.total), float(loss.consistency), 0.0, loss.num_pairs)
+            return [Losses(float(loss.total), float(loss.consistency), 0.0, loss.num_pairs)]
 
         return look_at_all(self.groups, self._read, look, self.accelerator, quiet)
 
@@ -220,12 +220,15 @@ class Surface:
     def first_look(self, quiet: bool) -> list[Losses]:
         """The base's on each image, from the proxies as in `Consensus`; a fixed target holds without surroundings."""
 
-        def look(image: Group) -> Losses:
-            region = image.mask if image.valid is None else image.mask & image.valid
-            distance = float(masked_l1(image.target, image.surface_target, region)) if region.any() else 0.0
-            return Losses(self.step.lambda_c * distance, distance, 0.0, 0)
+        def look(group: Group) -> list[Losses]:
+            regions = group.mask if group.valid is None else group.mask & group.valid
+            losses = []
+            for proxy, target, region in zip(group.target, group.surface_target, regions, strict=True):
+                distance = float(masked_l1(proxy, target, region)) if region.any() else 0.0
+                losses.append(Losses(self.step.lambda_c * distance, distance, 0.0, 0))
+            return losses
 
-        return look_at_all(self.images, self.images.read, look, self.accelerator, quiet)
+        return look_at_all(self.groups, self.groups.__getitem__, look, self.accelerator, quiet)
 
     def first_note(self, fresh: bool) -> str:
         """Nothing: what fits was measured."""
@@ -255,19 +258,19 @@ def settle_micro_batch(
 
 
 def look_at_all(
-    items: PreparedGroups | PreparedImages,
+    groups: PreparedGroups,
     read: Callable[[int], Any],
-    look: Callable[[Any], Losses],
+    look: Callable[[Any], list[Losses]],
     accelerator: Accelerator,
     quiet: bool,
 ) -> list[Losses]:
-    """`look` of each of them once, in their order, shared by the processes; the first ValueError is raised in all."""
-    mine, found = own_share(len(items), accelerator), []
-    bar = {"total": len(mine), "desc": "first look", "unit": items.unit, "delay": 2, "disable": quiet}
+    """`look` of every group once, in their order, shared by the processes; the first ValueError is raised in all."""
+    mine, found = own_share(len(groups), accelerator), []
+    bar = {"total": len(mine), "desc": "first look", "unit": "group", "delay": 2, "disable": quiet}
     with failing_together(accelerator):
-        for index, item in zip(mine, tqdm(read_ahead(read, mine, items.num_threads), **bar), strict=True):
+        for index, item in zip(mine, tqdm(read_ahead(read, mine, groups.num_threads), **bar), strict=True):
             found.append((index, look(item)))
-    return in_order(found, accelerator)
+    return [losses for several in in_order(found, accelerator) for losses in several]
 
 
 OBJECTIVES = {"consensus": Consensus, "surface": Surface}

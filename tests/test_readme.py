@@ -44,6 +44,9 @@ ONLY_PARSED = {  # the start of a command: why it is not run here
     "gift-peft deploy demo/adapter int8": "exports a minute; tests/deploy/test_onnx_export.py has all forms",
     "gift-peft deploy demo/adapter dialed": "exports a minute; tests/deploy/test_onnx_export.py has all forms",
     "gift-peft deploy demo/adapter space": "exports a minute; tests/deploy/test_space.py runs the page",
+    "gift-peft train --base demo/base --size 112x140 --dataset gift-i --target surface": "200 updates take minutes",
+    "gift-peft predict photo.jpg --base demo/base --adapter run/adapter": "needs the run of the 200 updates",
+    "gift-peft studio": "serves until it is stopped; tests/studio has what it does",
     "gift-peft predict photos --deployed": "needs an export; tests/deploy/test_runtime.py has small ones",
     "gift-peft evaluate --booster booster --predictions": "tests/evaluation/test_stored_predictions.py has the files",
 }

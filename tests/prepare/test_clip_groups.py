@@ -83,6 +83,16 @@ def test_a_second_run_reads_no_clip(raw, tmp_path, monkeypatch):
     assert not (tmp_path / "out/.prepare/clips/train/still").exists()
 
 
+def test_frames_are_chosen_again_when_a_mask_was_drawn(tmp_path):
+    """The usual order: a first run tells that the mask is missing."""
+    pictures, mask = views(3, SIZE, 3)
+    clip_of(tmp_path / "raw" / "hall" / "clip.mp4", pictures)
+    first = prepare_gift_i(tmp_path / "raw", tmp_path / "out")
+    assert first["groups"][0]["reasons"][0]["code"] == "masks_missing"
+    draw(tmp_path / "raw" / "hall" / "mask.png", mask)
+    assert prepare_gift_i(tmp_path / "raw", tmp_path / "out")["groups"][0]["status"] == "kept"
+
+
 def test_the_original_of_a_frame_is_found_from_the_report(raw, tmp_path):
     report = prepare_gift_i(raw, tmp_path / "out")
     for frame in entry(report, "still")["frames"]:

@@ -3,17 +3,22 @@
 import ast
 import inspect
 import re
+import shlex
+import shutil
 from dataclasses import fields
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from helpers.tiny import write_group
 
 import gift_peft.prepare
+from gift_peft.cli import main
 from gift_peft.prepare.prepare import prepare_gift_i
 from gift_peft.prepare.prepare_verb import PARTS
 from gift_peft.prepare.prepare_verb import parse_arguments as parse
 from gift_peft.prepare.settings import PrepareSettings
+from gift_peft.studio.studio_verb import make_parser
 
 PACKAGE = Path(gift_peft.prepare.__file__).parent
 
@@ -54,6 +59,24 @@ def test_help_says_every_option_its_default_and_an_example(capsys):
         assert re.search(rf"--{f.name.replace('_', '-')}[ ,]", words)
         if not isinstance(f.default, bool):
             assert f"{f.metadata['help']} (default: {f.default})" in words
+
+
+def test_missing_masks_point_to_the_studio(tmp_path, capsys):
+    """With a command that can be typed as it stands, whatever the folder is called."""
+    raw = tmp_path / "my photos"
+    for name in ("a", "b"):
+        shutil.rmtree(write_group(raw / name, 2, 0) / "masks")
+    with pytest.raises(SystemExit) as ended:
+        main(["prepare", str(raw), str(tmp_path / "out")])
+    told = capsys.readouterr()
+    assert ended.value.code == 1 and told.out.count("groups lack masks") == 1
+    commands = [shlex.split(words) for words in re.findall(r"`(gift-peft [^`]+)`", told.out)]
+    assert [words[1:] for words in commands] == [
+        ["studio", str(raw)],
+        ["prepare", str(raw), str(tmp_path / "out"), "--propose-masks"],
+    ]
+    assert make_parser().parse_args(commands[0][2:]).folder == str(raw)
+    assert told.err.count("gift-peft studio RAW") == 2  # of each group
 
 
 def test_no_circle_among_the_modules_of_prepare():

@@ -192,7 +192,12 @@ def explain_missing(image_path: Path, group_dir: Path, root: Path) -> str:
     for folder in filter(Path.is_dir, listing.entries(group_dir)):
         if not holds_no_photos(folder.name) and same_name(image_path.stem) in listing.photo_stems(folder):
             parts.append(f"if {folder.name}/ holds masks and not photos, call it masks/")
-    return "; ".join([*parts, "`gift-peft prepare RAW OUT --propose-masks` draws first ones"])
+    return "; ".join(
+        [
+            *parts,
+            "draw it with `gift-peft studio RAW`, or `gift-peft prepare RAW OUT --propose-masks` draws first ones",
+        ]
+    )
 
 
 def _unread(image_path: Path, group_dir: Path, root: Path, listing: Listing) -> list[str]:

@@ -117,7 +117,7 @@ def _make(group: ClipGroup, folder: Path, job: Job, digest: str) -> dict:
     photos = sum(len(pose.frames) for pose in choice.poses)
     told = f"{photos} of {stated} frames chosen from {', '.join(path.name for path in group.clips)}"
     made = {"digest": digest, "groups": dict.fromkeys(names), "notes": [told, *choice.notes]}
-    with whole_folder(folder) as temporary:
+    with whole_folder(folder, ["*"]) as temporary:  # it lies in OUT's own folder: nobody else writes there
         for name, pose in zip(names, choice.poses, strict=True):
             made["groups"][name] = _write_group(group, choice, pose, temporary / name)
         write_whole(temporary / CHOSEN, json.dumps(made))

@@ -8,7 +8,6 @@ import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import Field, fields
-from importlib.util import find_spec
 from pathlib import Path
 
 from gift_peft.captures.known_datasets import choose_layout
@@ -73,16 +72,13 @@ def _tell_masks(groups: list[dict], raw: str, out: str) -> None:
     if not lacking:
         return
     proposing = shlex.join(["gift-peft", "prepare", raw, out, "--propose-masks"])
-    drawing = f"`{shlex.join(['gift-peft', 'studio', raw])}` draws them in a browser, or " if _has_studio() else ""
+    drawing = shlex.join(["gift-peft", "studio", raw])
     one = len(lacking) == 1
     print(
-        f"{'A group lacks' if one else f'{len(lacking)} groups lack'} masks: {drawing}`{proposing}` draws first ones; "
+        f"{'A group lacks' if one else f'{len(lacking)} groups lack'} masks: draw them in a browser with `{drawing}`, "
+        f"or `{proposing}` draws first ones; "
         "one mask for a group is enough, as mask.png beside its photos (docs/masks.md)"
     )
-
-
-def _has_studio() -> bool:
-    return find_spec("gift_peft.studio") is not None
 
 
 def _next_command(statistics: dict[str, dict], out: str) -> str:

@@ -66,15 +66,9 @@ def propose(images: Sequence[np.ndarray]) -> Proposal:
     Raises:
         ValueError: fewer than two images, other shapes or types, differing sizes.
     """
-    if len(images) < 2:
-        raise ValueError(f"{len(images)} image(s); a proposal compares at least two")
-    for image in images:
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.shape != images[0].shape:
-            raise ValueError("a proposal takes (height, width, 3) uint8 RGB images of one size")
+    change, noise = change_map(images)
     height, width = images[0].shape[:2]
-    change = _change(images)
-    noise = max(NOISE_FACTOR * float(np.quantile(change, 0.1)), LEAST_CHANGE)
-    mask = _clean(_strong(change, noise), change)
+    mask = clean(strong(change, noise), change)
     figures = _figures(mask, change, noise)
     full = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
     return Proposal(full, float(np.prod(figures)), *figures, noise)
@@ -83,13 +77,26 @@ def propose(images: Sequence[np.ndarray]) -> Proposal:
 # ---- what changes ----
 
 
-def _change(images: Sequence[np.ndarray]) -> np.ndarray:
-    """(h, w) float32 at working size: upper quartile over the images of the distance to their median, in Lab units.
+def change_map(images: Sequence[np.ndarray], side: int = WORKING_SIDE) -> tuple[np.ndarray, float]:
+    """Where a group's registered images differ, and the change that counts as none; both in Lab units.
 
-    The quartile, because an observation may look like the median by chance and one may hold something that passed by.
+    The map (h, w) float32, its longer side at most `side`, is the upper quartile over the images of the distance to
+    their median: an observation may look like the median by chance, and one may hold something that passed by.
+
+    Raises ValueError: fewer than two images, other shapes or types, differing sizes.
     """
+    if len(images) < 2:
+        raise ValueError(f"{len(images)} image(s); a proposal compares at least two")
+    for image in images:
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.shape != images[0].shape:
+            raise ValueError("a proposal takes (height, width, 3) uint8 RGB images of one size")
+    change = _change(images, side)
+    return change, max(NOISE_FACTOR * float(np.quantile(change, 0.1)), LEAST_CHANGE)
+
+
+def _change(images: Sequence[np.ndarray], side: int) -> np.ndarray:
     height, width = images[0].shape[:2]
-    scale = min(1.0, WORKING_SIDE / max(height, width))
+    scale = min(1.0, side / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     labs = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]
     labs = np.stack([cv2.cvtColor(lab.astype(np.float32) / 255, cv2.COLOR_RGB2LAB) for lab in labs])
@@ -125,7 +132,7 @@ def _match_light(lab: np.ndarray, reference: np.ndarray) -> np.ndarray:
 # ---- which of it is the target ----
 
 
-def _strong(change: np.ndarray, noise: float) -> np.ndarray:
+def strong(change: np.ndarray, noise: float) -> np.ndarray:
     """(h, w) bool: in each connected region above the noise, what reaches a share of that region's strong changes."""
     labels, stats = _regions(change > noise)
     strong = np.zeros(change.shape, bool)
@@ -136,7 +143,7 @@ def _strong(change: np.ndarray, noise: float) -> np.ndarray:
     return strong
 
 
-def _clean(mask: np.ndarray, change: np.ndarray) -> np.ndarray:
+def clean(mask: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Gaps closed, holes filled, specks removed; regions that carry a tenth of the strongest one's change stay."""
     reach = max(3, round(0.01 * max(mask.shape)) | 1)
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))

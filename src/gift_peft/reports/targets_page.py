@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from gift_peft.colormap import color_range, colorize
+from gift_peft.colormap import color_range, colorize, colorize_error
 from gift_peft.evaluation.alignment import align
 from gift_peft.models.pixels import resize_mask
 from gift_peft.reports.figures import html_figure, outline
@@ -64,7 +64,7 @@ def targets_page(groups: Iterable[GroupPictures], kind: str) -> str:
         for group in groups:
             for index in range(len(group.names)):
                 total += 1
-                yield _shown(group, index, kind)
+                yield show_observation(group, index, kind)
 
     largest = heapq.nlargest(LIMIT, shown(), key=lambda one: one.difference)
     told = f"{total} observations, sorted by how far the surface target is from the base."
@@ -73,7 +73,8 @@ def targets_page(groups: Iterable[GroupPictures], kind: str) -> str:
     return PAGE.format(told=told, observations="\n".join(one.text for one in largest))
 
 
-def _shown(group: GroupPictures, index: int, kind: str) -> Shown:
+def show_observation(group: GroupPictures, index: int, kind: str, with_difference: bool = False) -> Shown:
+    """One observation; `with_difference` adds how far surface target and base are apart, bright where most."""
     base, target = group.proxies[index].numpy(), group.surface_target[index].numpy()
     mask = resize_mask(group.masks[index], base.shape)
     valid = resize_mask(group.valids[index], base.shape) if len(group.valids) else np.ones_like(mask)
@@ -103,6 +104,11 @@ def _shown(group: GroupPictures, index: int, kind: str) -> Shown:
     pictures = {group.names[index]: photo}
     for name, values in maps.items():
         pictures[name] = Image.fromarray(colorize(values, low, high, kind)).resize((WIDTH, height))
+    if with_difference:
+        apart = np.abs(target - base)
+        pictures["their difference"] = Image.fromarray(colorize_error(apart, float(apart.max()))).resize(
+            (WIDTH, height)
+        )
     figures = [
         html_figure(name, Image.fromarray(outline(np.asarray(picture), mask)), quality=85)
         for name, picture in pictures.items()

@@ -159,6 +159,8 @@ def choose(groups: list[Observed], photos: str) -> list[Observed]:
         return [group.only([i]) for group in groups for i in np.flatnonzero(~group.seen)]
     if photos == "seen singles":
         return [group.only([i]) for group in groups for i in np.flatnonzero(group.seen)]
+    if photos == "one covered":  # one of each group, in which the surface shows
+        return [group.only(np.flatnonzero(group.seen)[:1]) for group in groups if group.seen.any()]
     if photos == "singles":
         return [group.only([i]) for group in groups for i in range(len(group.images))]
     if photos == "worse half":  # at least two, by the base's own error inside the target
@@ -213,7 +215,7 @@ def run(trial: plan.Trial, seed: int, sets: dict[str, list[Observed]], out: Path
     groups = [group for name, part in trial.train for group in plan.part(sets[name], part)]
     groups = choose(groups, trial.photos)
     if trial.count:
-        groups = groups[: trial.count]
+        groups = sorted(groups, key=lambda group: group.name.split("_")[-1])[: trial.count]  # the kinds in turn
     model, seconds = train(trial, groups, seed, out)
     result = {"trial": trial.describe(), "seed": seed, "photos": sum(len(group.images) for group in groups)}
     result |= {"groups": len(groups), "train_seconds": seconds, "sets": {}}

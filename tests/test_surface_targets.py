@@ -1,5 +1,6 @@
 """Surface targets against numpy, against planes that are known, and under changes of scale, shift and order."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -40,6 +41,7 @@ def behind(plane, count, rng, share):
 # ---- quantile ----
 
 
+@settings(deadline=None)
 @given(SEEDS, st.integers(1, 6), st.floats(0, 1))
 def test_quantile_is_numpys_over_the_observations_that_hold_the_pixel(seed, count, q):
     rng = np.random.default_rng(seed)
@@ -88,6 +90,42 @@ def test_each_component_has_a_plane_of_its_own():
     values = behind(truth, 4, rng, share=0.3)
     found = plane_surface(values, np.repeat((left | right)[None], 4, 0))
     assert np.abs(found - truth)[left | right].max() < 1e-3
+
+
+def test_hundreds_of_components_are_those_of_each_alone():
+    rng = np.random.default_rng(2)
+    union = np.kron(rng.random((6, 8)) < 0.5, np.ones((4, 4), bool))  # blocks that touch at corners too
+    union[::2, ::2] |= rng.random((H // 2, W // 2)) < 0.2
+    values, mask = 1 / (1 + rng.random((3, H, W)) + 0.1 * ROWS), np.repeat(union[None], 3, 0)
+    target = surface_target(values, mask, kind="depth", model="plane")
+    count, labels = cv2.connectedComponents(union.astype(np.uint8))
+    assert len(target.model) == count - 1 > 10 and {"plane", "quantile"} == set(target.model)
+    for number, model in enumerate(target.model, 1):
+        alone = surface_target(values, np.repeat((labels == number)[None], 3, 0), kind="depth", model="plane")
+        assert alone.model == [model]
+        np.testing.assert_allclose(target.depth[:, labels == number], alone.depth[:, labels == number], rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["depth", "inverse_depth"])
+@pytest.mark.parametrize("pixels", [0, 1, 2, 15])
+def test_a_target_of_which_few_pixels_are_known_gets_the_quantile(pixels, kind):
+    """The mask is large, but pixels do not exist, or a depth of 0 says nothing."""
+    rng = np.random.default_rng(pixels)
+    values, mask = np.repeat(1 + rng.random((1, H, W)), 2, 0), np.repeat(box()[None], 2, 0)
+    values[mask] += rng.random(np.count_nonzero(mask))
+    known = ~mask
+    known[:, 10, 5 : 5 + pixels] = True
+    valid = None if kind == "depth" else known
+    values = np.where(known, values, 0) if kind == "depth" else values
+    if kind == "inverse_depth" and not pixels:
+        with pytest.raises(ValueError, match="every mask is empty"):
+            surface_target(values, mask, valid=valid)
+        return
+    target = surface_target(values, mask, kind=kind, valid=valid, model="plane", quantile=1)
+    assert target.model == ["quantile"] and np.isfinite(target.depth).all()
+    nearest, held = values.min(0) if kind == "depth" else values.max(0), known[0] & box()
+    for observation in target.depth:
+        np.testing.assert_allclose(observation[held], nearest[held], rtol=1e-6)
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 3, 4, 5])
@@ -248,6 +286,22 @@ def test_the_order_of_the_observations_does_not_matter(seed, order):
     np.testing.assert_allclose(second.depth, first.depth[order], atol=2e-4)
 
 
+@pytest.mark.parametrize("quantile", [0.2, 0.8])
+def test_disagreement_is_a_distance(quantile):
+    values = np.random.default_rng(13).random((3, H, W))
+    target = surface_target(values, np.repeat(box()[None], 3, 0), quantile=quantile)
+    assert target.disagreement[0] > 0
+
+
+def test_half_precision_comes_in():
+    rng = np.random.default_rng(14)
+    values, mask = torch.from_numpy(behind(a_plane(rng), 3, rng, share=0.4)), torch.from_numpy(box()).repeat(3, 1, 1)
+    for dtype in (torch.bfloat16, torch.float16):
+        found = surface_target(values.to(dtype), mask).depth
+        assert found.dtype == torch.float64
+        assert torch.equal(found, surface_target(values.to(dtype).double(), mask).depth)
+
+
 def test_torch_comes_back_as_torch():
     rng = np.random.default_rng(10)
     values = torch.from_numpy(behind(a_plane(rng), 3, rng, share=0.4)).float()
@@ -272,6 +326,7 @@ def test_what_is_refused():
         ((values, mask.astype(float)), "mask is float64"),
         ((values[0], mask[0]), r"\(N,H,W\)"),
         ((values, mask[:1]), r"\(N,H,W\)"),
+        ((values[:0], mask[:0]), "none empty"),
     ):
         for function in (surface_target, plane_surface, align_observations):
             with pytest.raises(ValueError, match=message):
@@ -289,6 +344,8 @@ def test_what_is_refused():
             surface_target(values, mask, **options)
     with pytest.raises(ValueError, match="every mask is empty"):
         surface_target(values, ~(mask | True))
+    with pytest.raises(ValueError, match="none empty"):
+        quantile_surface(values[:0], mask[:0], 0.8)
 
 
 # ---- fills ----

@@ -26,7 +26,7 @@ RULE = "surface 1"  # changes with whatever changes a target or a fill: stored t
 MODELS = ("auto", "plane", "quantile")
 KINDS = ("depth", "inverse_depth")
 SURFACES = (None, "mirror", "transparent")
-MIN_PIXELS = 16  # of a component's outline, for a plane; three parameters from fewer say nothing
+MIN_PIXELS = 16  # of a component that some observation holds, for a plane; three parameters from fewer say nothing
 MIN_COMMON = 64  # pixels outside every mask, for a scale and a shift
 OUTLIER = 5  # times the median distance from the group: something else is there, for the alignment
 SMOOTHING = 1e-4  # of the component's spread: residuals below it count as none
@@ -101,10 +101,10 @@ def plane_surface(
     if quantile is not None:
         _check_share("quantile", quantile, closed=True)
     surface = _quantile(values, inside, tau if quantile is None else quantile)
-    for component in _components(inside.any(0)):
-        plane = _plane(values, inside & component, component, tau, positive)
+    for window, component in _components(inside.any(0)):
+        plane = _plane(values[:, *window], inside[:, *window] & component, component, tau, positive)
         if plane is not None:
-            surface[component] = plane
+            surface[window][component] = plane
     return restore(surface)
 
 
@@ -160,8 +160,7 @@ def surface_target(
         ValueError: shapes that differ, NaN or infinity in a valid pixel, every mask empty, an unknown kind, model or
             surface.
     """
-    choices = (("kind", kind, KINDS), ("model", model, MODELS), ("surface", surface, SURFACES))
-    for name, value, known in choices:
+    for name, value, known in (("kind", kind, KINDS), ("model", model, MODELS), ("surface", surface, SURFACES)):
         if value not in known:
             raise ValueError(f"{name} {value!r}: it is one of {', '.join(map(str, known))}")
     _check_share("quantile", quantile, closed=True)
@@ -181,18 +180,17 @@ def surface_target(
     seen = inside_stack & there_stack
     spread = _spread(stack[there_stack])
     upper, lower = _quantile(stack, seen, quantile), _quantile(stack, seen, 1 - quantile)
-    several = seen.sum(0) > 1
+    gap = np.where(seen.sum(0) > 1, np.abs(upper - lower), np.nan)
     found, models, residuals, disagreements = upper.copy(), [], [], []
-    for component in _components(inside.any(0)):
+    for window, component in _components(inside.any(0)):
         plane = None
         if model != "quantile":
-            plane = _plane(stack, seen & component, component, tau, positive=kind == "depth")
-        gap = (upper - lower)[component & several]
-        disagreement = _median(gap)
-        residual = np.nan if plane is None else _median(np.abs(plane - upper[component]))
+            plane = _plane(stack[:, *window], seen[:, *window] & component, component, tau, kind == "depth")
+        disagreement = _median(gap[window][component])
+        residual = np.nan if plane is None else _median(np.abs(plane - upper[window][component]))
         takes_plane = plane is not None and (model == "plane" or residual < PLANE_RATIO * disagreement)
         if takes_plane:
-            found[component] = plane
+            found[window][component] = plane
         models.append("plane" if takes_plane else "quantile")
         residuals.append(float(residual / spread) if spread else np.nan)
         disagreements.append(float(disagreement / spread) if spread else np.nan)
@@ -259,7 +257,7 @@ def _plane(
     index, rows, columns = np.nonzero(inside)
     y = values[index, rows, columns]
     spread = _spread(y)
-    if np.count_nonzero(component) < MIN_PIXELS or not spread:
+    if np.count_nonzero(inside.any(0)) < MIN_PIXELS or not spread:
         return None
     # Centered and scaled, so that the normal equations are as good as they can be.
     center, size = (rows.mean(), columns.mean()), max(np.ptp(rows), np.ptp(columns)) / 2
@@ -271,9 +269,8 @@ def _plane(
     rows, columns = np.nonzero(component)
     design = (np.ones(len(rows)), (columns - center[1]) / size, (rows - center[0]) / size)
     plane = base + spread * sum(weight * column for weight, column in zip(solution, design, strict=True))
-    low, high = y.min(), y.max()
-    room = (high - low) / 2
-    if not np.isfinite(plane).all() or plane.min() < low - room or plane.max() > high + room:
+    room = np.ptp(y) / 2
+    if not np.isfinite(plane).all() or plane.min() < y.min() - room or plane.max() > y.max() + room:
         return None
     return None if positive and plane.min() <= 0 else plane
 
@@ -328,12 +325,13 @@ def _least_absolute(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     return float(slope), float(offset * spread - slope * middle)
 
 
-def _components(union: np.ndarray) -> list[np.ndarray]:
-    """The connected parts (8 neighbors) of a (H,W) bool region, in reading order."""
+def _components(union: np.ndarray) -> list[tuple[tuple[slice, slice], np.ndarray]]:
+    """The connected parts (8 neighbors) of a (H,W) bool region, in reading order: (window, which pixels of it)."""
     import cv2
 
-    count, labels = cv2.connectedComponents(union.astype(np.uint8), connectivity=8)
-    return [labels == number for number in range(1, count)]
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(union.astype(np.uint8), connectivity=8)
+    windows = [(slice(top, top + rows), slice(left, left + columns)) for left, top, columns, rows, _ in boxes]
+    return [(windows[number], labels[windows[number]] == number) for number in range(1, count)]
 
 
 # ---- arrays ----
@@ -367,8 +365,8 @@ def _arrays(
     for name, region in checked:
         if region.dtype != bool:
             raise ValueError(f"{name} is {region.dtype}; it is bool")
-        if array.ndim != 3 or region.shape != array.shape:
-            raise ValueError(f"predictions {array.shape} and {name} {region.shape}: both are (N,H,W)")
+        if array.ndim != 3 or not array.size or region.shape != array.shape:
+            raise ValueError(f"predictions {array.shape} and {name} {region.shape}: both are (N,H,W), none empty")
     region = checked[-1][1] if valid is not None else (np.ones_like(inside) if everywhere else inside)
     for number, (own, there) in enumerate(zip(array, region, strict=True)):
         if not np.isfinite(own[there]).all():
@@ -381,7 +379,10 @@ def _arrays(
 
 
 def _numpy(array: Array) -> np.ndarray:
-    return array if isinstance(array, np.ndarray) else array.detach().cpu().numpy()
+    if isinstance(array, np.ndarray):
+        return array
+    array = array.detach().cpu()
+    return (array.double() if array.is_floating_point() else array).numpy()  # numpy has no bfloat16
 
 
 def _spread(values: np.ndarray) -> float:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from gift_peft.evaluation.surface_check import describe, surface_lines
+from gift_peft.evaluation.surface_check import describe, describe_nothing, surface_lines
 from gift_peft.rules import GroupPictures
 from gift_peft.surface_targets import surface_target
 
@@ -110,3 +110,13 @@ def test_without_a_target_at_this_size_nothing_is_claimed():
         "unknown surface (1 group): no target at this size"
     ]
     assert not math.isnan(base.sum())
+
+
+def test_groups_without_a_target_at_this_size_are_counted():
+    pictures, _ = group(np.random.default_rng(3), 1)
+    nothing = describe_nothing(pictures) | {"surface": "mirror"}
+    (line,) = surface_lines([("a", nothing)])
+    assert line == "mirror (1 group): no target at this size"
+    for pair in ([200.0, 100.0], None):
+        *_, line = surface_lines([("a", told("mirror", [pair])), ("b", nothing)])
+        assert line == "mirror (2 groups): no target at this size in 1 group, such as b"

@@ -15,6 +15,8 @@ from peft import PeftModel
 from transformers import AutoModelForDepthEstimation
 
 from gift_peft import evaluate_gift_i, gift_loss, load_gift_i
+from gift_peft.dataset.loader import PreparedGroups, PreparedImages
+from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.moge import MogeImageProcessorPil
@@ -74,6 +76,18 @@ def test_a_surface_run_takes_it(tiny_vit, tmp_path):
     options = {"size": "28x56", "target": "surface", "max_steps": 3, "proxies_dir": str(tmp_path / "proxies")}
     result = train(arguments(base, tree, tmp_path / "out", checkpointing_steps=None, **options))
     assert result.step == 3 and np.isfinite(result.metrics[-1]["loss"])
+    # Its sky is left out as with the paper's objective, in the photo and in its mirror image.
+    places = {"size": SIZE, "proxies_dir": tmp_path / "proxies"}
+    rows = load_gift_i(tree, "train", teacher=base, surface=SurfaceSettings(), **places)
+    model = DepthModel.from_pretrained(base, size=SIZE)
+    images = PreparedImages(PreparedGroups(rows, model.processor, SIZE, num_threads=0))
+    for index in range(len(images)):
+        for flip in (False, True):
+            image = images.read(index, flip)
+            known = model.predict_proxies(image.pixel_values) != UNKNOWN
+            assert 0.1 < known.float().mean() < 0.9 and image.surface_target.abs().max() < 1e6
+            assert torch.equal(image.valid & ~image.mask, known & ~image.mask)
+            assert (image.valid >= known).all(), "inside the target others may know"
 
 
 @pytest.mark.slow

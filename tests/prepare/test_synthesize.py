@@ -147,6 +147,30 @@ def test_a_raw_tree_gives_a_group_for_every_train_photo(tmp_path):
     assert not again.groups and {*again.skipped.values()} == {"these are painted copies already"}
 
 
+@pytest.mark.parametrize("form", ["mask.png", "the only mask", "the only annotation"])
+def test_one_mask_for_a_group_is_that_of_each_of_its_photos(tmp_path, form):
+    raw = tmp_path / "raw"
+    group = write_group(raw / "train/pane", 3, 0)
+    expected = pixels(group / "masks/1.png")
+    if form == "mask.png":
+        (group / "masks/1.png").rename(group / "mask.png")
+    elif form == "the only annotation":
+        rows, columns = np.nonzero(expected)
+        corners = [[int(columns.min()), int(rows.min())], [int(columns.max()) + 1, int(rows.max()) + 1]]
+        shape = {"label": "glass", "shape_type": "rectangle", "points": corners}
+        (group / "1.json").write_text(json.dumps({"shapes": [shape], "imagePath": "1.png"}))
+        (group / "masks/1.png").unlink()
+    for name in ("0.png", "2.png"):
+        (group / "masks" / name).unlink()
+    report = synthesize_groups(raw, tmp_path / "out")
+    assert report.groups == ["pane__0", "pane__1", "pane__2"] and not report.rejected
+    for name in report.groups:
+        found = pixels(tmp_path / "out/train" / name / "masks/1_fill.png") > 0
+        assert np.mean(found != (expected > 0)) < 0.05
+    trained = load_gift_i(raw, "train")[0]
+    assert all(np.mean((np.asarray(mask) > 0) != (expected > 0)) < 0.05 for mask in trained["masks"])
+
+
 def test_without_split_folders_a_group_with_a_reference_is_for_validation(tmp_path):
     write_group(tmp_path / "raw/pane", 1, 0)
     write_group(tmp_path / "raw/shower", 2, 3, reference=True)

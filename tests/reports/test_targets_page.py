@@ -12,6 +12,7 @@ from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.dataset.rows import parsed
 from gift_peft.reports import targets_page as page
+from gift_peft.rules import UNKNOWN
 from gift_peft.training.teacher import make_proxies
 
 pytestmark = pytest.mark.usefixtures("fresh_cache")
@@ -47,6 +48,24 @@ def test_a_known_move_is_told(groups):
         text = page.targets_page([known], kind)
         assert text.count("moved by 10.0% in the median, nearer on 100% of the target") == 2
         assert "from the treated reference 10.0% before, 0.0% after" in text
+
+
+def test_what_the_teacher_leaves_out_sets_no_colors_and_no_figures(groups):
+    """Sky of a network that masks itself, in one observation and its reference; or zeros all around the target."""
+    group = next(group for group in groups if group.reference_proxy is not None)
+    mask = torch.stack([torch.from_numpy(page.resize_mask(mask, SIZE)) for mask in group.masks])
+    sky = torch.zeros(mask.shape, dtype=torch.bool)
+    sky[:, :10] = True
+    target = group.proxies + 0.1 * mask
+    plain = page.targets_page([replace(group, surface_target=target)], "depth")
+    known = {name: getattr(group, name) for name in ("proxies", "reference_proxy")}
+    known["surface_target"] = target
+    unknown = {name: maps.masked_fill(sky[0] if maps.ndim == 2 else sky, UNKNOWN) for name, maps in known.items()}
+    text = page.targets_page([replace(group, **unknown)], "depth")
+    moved = [[float(number) for number in re.findall(r"moved by ([\d.]+)%", each)] for each in (plain, text)]
+    assert moved[1] == pytest.approx(moved[0], rel=0.5) and "before" in text
+    zeros = replace(group, proxies=torch.where(mask, group.proxies, 0), surface_target=torch.where(mask, target, 0))
+    assert "before" not in page.targets_page([zeros], "inverse_depth")
 
 
 def test_long_pages_are_cut_and_say_so(groups, monkeypatch):

@@ -272,7 +272,8 @@ def test_nothing_to_teach_and_names_that_clash(raw_tree, base_dir):
 
 def test_a_bad_prediction_names_group_and_image(raw_tree, base_dir, monkeypatch):
     make_proxies(base_dir, raw_tree, size=SIZE)
-    monkeypatch.setattr(DepthModel, "predict", lambda self, pixels, size=2: torch.full((len(pixels), *SIZE), np.nan))
+    bad = lambda self, pixels, size=2: torch.full((len(pixels), *SIZE), np.nan)  # noqa: E731
+    monkeypatch.setattr(DepthModel, "predict_proxies", bad)
     with pytest.raises(ValueError) as excinfo:
         make_proxies(base_dir, raw_tree, size=SIZE, surface=TWO)
     one_line(excinfo, "group scene_0, 0.png", "flipped", "NaN")

@@ -16,6 +16,7 @@ import torch
 
 from gift_peft.dataset.cache import GroupCache
 from gift_peft.dataset.tensors import Group
+from gift_peft.rules import UNKNOWN
 
 Item = TypeVar("Item")
 
@@ -111,6 +112,9 @@ class PreparedImages:
             image.valid = None if image.valid is None else image.valid.flip(-1)
             image.surface_target = image.surface_target_flipped
         image.surface_target_flipped = None
+        if (unknown := image.surface_target == UNKNOWN).any():  # as with the proxies of whole groups
+            image.valid = ~unknown if image.valid is None else image.valid & ~unknown
+            image.surface_target = image.surface_target.masked_fill(unknown, 0)
         return image
 
     def take(self, items: Iterable[tuple[int, bool]]) -> Iterator[Group]:

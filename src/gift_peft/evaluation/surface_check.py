@@ -20,7 +20,7 @@ from gift_peft.evaluation.statistics import GroupBootstrap
 from gift_peft.evaluation.tables import counted
 from gift_peft.losses import prediction_spread
 from gift_peft.models.pixels import resize_mask
-from gift_peft.rules import GroupPictures
+from gift_peft.rules import UNKNOWN, GroupPictures
 from gift_peft.surface_targets import SurfaceTarget
 
 AGAINST = {"depth": "true depth", "proxy": "the treated reference"}
@@ -40,7 +40,9 @@ def describe(group: GroupPictures, proxies: torch.Tensor, found: SurfaceTarget, 
         inside the mask: `depth` in mm, `proxy` in native units. What is not known is None.
     """
     rows = []
-    targets = torch.as_tensor(found.depth)
+    targets, known = torch.as_tensor(found.depth), proxies != UNKNOWN
+    farthest = proxies[known].max()  # stands where the teacher's own mask, of networks that predict depth, says sky
+    proxies, targets = proxies.where(known, farthest), targets.where(targets != UNKNOWN, farthest)
     for index, name in enumerate(group.names):
         base, target = proxies[index], targets[index]
         valid = group.valids[index] if len(group.valids) else np.ones(group.masks[index].shape, bool)
@@ -62,6 +64,11 @@ def describe(group: GroupPictures, proxies: torch.Tensor, found: SurfaceTarget, 
         rows.append(row)
     fits = {name: [_known(value) for value in getattr(found, name)] for name in ("residual", "disagreement")}
     return {"surface": group.surface, "model": found.model, **fits, "observations": rows}
+
+
+def describe_nothing(group: GroupPictures) -> dict:
+    """What `describe` returns for a group without a pixel of target at the network's size."""
+    return {"surface": group.surface, "model": [], "residual": [], "disagreement": [], "observations": []}
 
 
 def _errors(
@@ -96,6 +103,9 @@ def surface_lines(groups: Iterable[tuple[str, dict]]) -> list[str]:
         start = f"{kind} ({counted(len(kinds[kind]), 'group')})"
         measured = [line for against in AGAINST if (line := _measured(kinds[kind], against))]
         lines += [f"{start}: {line}" for line in measured or [_described(kinds[kind])]]
+        lost = [name for name, told in kinds[kind] if all(row["nearer"] is None for row in told["observations"])]
+        if 0 < len(lost) < len(kinds[kind]):
+            lines.append(f"{start}: no target at this size in {counted(len(lost), 'group')}, such as {lost[0]}")
     return lines
 
 

@@ -20,7 +20,7 @@ import yaml
 from PIL import Image
 from tqdm import tqdm
 
-from gift_peft.captures.masks import is_mask_file
+from gift_peft.captures.masks import MaskSource, is_mask_file
 from gift_peft.captures.tree import Capture, check_masks, find_groups, read_capture
 from gift_peft.files import read_yaml, remove_folder, strangers, whole_folder, write_whole
 from gift_peft.images import image_digest, is_image_file, read_image
@@ -195,8 +195,14 @@ def _read_tree(photos: Path, report: SynthesisReport) -> list[Capture]:
             elif MARK in capture.facts:
                 report.skipped[name] = "these are painted copies already"
             else:
-                captures.append(capture)
+                captures.append(replace(capture, common=_for_all(capture)))
     return captures
+
+
+def _for_all(capture: Capture) -> MaskSource | None:
+    """What holds for the photos of a group without a mask of their own: `mask.*`, or the only annotation there is."""
+    annotated = [mask for mask in capture.masks if mask is not None and mask.annotated]
+    return annotated[0] if capture.common is None and len(annotated) == 1 else capture.common
 
 
 # ---- one group ----

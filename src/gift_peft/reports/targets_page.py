@@ -16,7 +16,7 @@ from gift_peft.colormap import color_range, colorize
 from gift_peft.evaluation.alignment import align
 from gift_peft.models.pixels import resize_mask
 from gift_peft.reports.figures import html_figure, outline
-from gift_peft.rules import GroupPictures
+from gift_peft.rules import UNKNOWN, GroupPictures
 
 WIDTH = 320  # of a picture
 LIMIT = 400  # observations: a page of more is slow to open
@@ -77,16 +77,21 @@ def _shown(group: GroupPictures, index: int, kind: str) -> Shown:
     base, target = group.proxies[index].numpy(), group.surface_target[index].numpy()
     mask = resize_mask(group.masks[index], base.shape)
     valid = resize_mask(group.valids[index], base.shape) if len(group.valids) else np.ones_like(mask)
+    valid &= base != UNKNOWN
     region, spread = mask & valid, float(np.subtract(*np.percentile(base[valid], (95, 5)))) if valid.any() else 0.0
     maps, told = {"the base": base, "surface target": target}, "no target at this size"
     difference = 0.0
-    if region.any() and spread > 0:
+    if region.any() and not spread:
+        told = "the base says one depth for the whole photo"
+    elif region.any():
         moved = (target - base)[region]
         nearer = np.mean(moved > 0 if kind == "inverse_depth" else moved < 0)
         difference = float(np.median(np.abs(moved))) / spread
         told = f"moved by {difference:.1%} in the median, nearer on {nearer:.0%} of the target"
     reference = None if group.reference_proxy is None else group.reference_proxy.numpy()
-    other = ~mask & valid
+    other = ~mask & valid & (base > 0)  # `align` takes no others
+    if reference is not None:
+        other &= reference != UNKNOWN
     if reference is not None and region.any() and spread > 0 and other.any() and np.ptp(reference[other]) > 0:
         reference = np.asarray(align(reference, base, other, "native", kind).aligned)
         maps["treated reference"] = reference

@@ -38,7 +38,7 @@ from gift_peft.dataset.proxies import (
     write_surface,
 )
 from gift_peft.dataset.rows import parsed
-from gift_peft.evaluation.surface_check import describe, surface_lines
+from gift_peft.evaluation.surface_check import describe, describe_nothing, surface_lines
 from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import pixel_settings, resize_mask
@@ -189,17 +189,14 @@ def _surface_row(
     """(target, target_flipped), each (N, h, w), and what is known of them, of one row; ValueError naming the group.
 
     A row without a pixel to teach at this size keeps its own predictions. Flipped are the pixels that the network
-    takes, as training does it: what a resized photo's mirror image shows may differ by rounding.
+    takes, as training does it: what a resized photo's mirror image shows may differ by rounding. What the teacher
+    itself leaves out stays UNKNOWN, unless other predictions say what is there.
     """
     masks = np.stack([resize_mask(mask, model.size) for mask in row.masks])
-    valids = np.stack([resize_mask(valid, model.size) for valid in row.valids]) if row.valids else None
-    if (unknown := (proxies == UNKNOWN).numpy()).any():  # what the teacher itself leaves out says nothing
-        valids = ~unknown if valids is None else valids & ~unknown
-        farthest = proxies.max() if not unknown.all() else proxies.new_ones(())
-        proxies = torch.where(proxies == UNKNOWN, farthest, proxies)
-    flipped = model.predict(model.inputs(row.images).flip(-1), batch_size)
-    if not (masks if valids is None else masks & valids).any():
-        return proxies, flipped, {}
+    valids = np.stack([resize_mask(valid, model.size) for valid in row.valids]) if row.valids else np.ones_like(masks)
+    flipped = model.predict_proxies(model.inputs(row.images).flip(-1), batch_size)
+    if not (masks & valids).any():
+        return proxies, flipped, describe_nothing(row)
     fills: list[torch.Tensor] = []
     fills_flipped: list[torch.Tensor] = []
     for name, image, mask, mirrored in zip(row.names, row.images, row.masks, flipped, strict=True):
@@ -207,18 +204,24 @@ def _surface_row(
         painted = paint_fills(np.asarray(image), mask, settings.fills, settings.seed)
         if settings.fills:
             pixels = torch.cat([model.inputs([Image.fromarray(fill)]) for fill in painted])
-            fills.append(model.predict(pixels, batch_size))
-            fills_flipped.append(model.predict(pixels.flip(-1), batch_size))
+            # UNKNOWN is no depth: `surface_target` leaves it out like every value that is not positive.
+            fills.append(model.predict_proxies(pixels, batch_size))
+            fills_flipped.append(model.predict_proxies(pixels.flip(-1), batch_size))
             _require_finite(torch.stack([fills[-1], fills_flipped[-1]]), row, f"a fill of {name}")
 
-    def surface(own: torch.Tensor, painted: list[torch.Tensor], turn: slice) -> tuple[torch.Tensor, SurfaceTarget]:
+    def surface(
+        own: torch.Tensor, painted: list[torch.Tensor], turn: slice
+    ) -> tuple[torch.Tensor, SurfaceTarget | None]:
+        inside, there = masks[:, :, turn], valids[:, :, turn] & (own != UNKNOWN).numpy()
+        if not (inside & there).any():
+            return own, None
         found = surface_target(
             own.numpy(),
-            masks[:, :, turn],
+            inside,
             row.surface,
             torch.stack(painted).numpy() if painted else None,
             model.known_kind(),
-            None if valids is None else valids[:, :, turn],
+            there,
             settings.surface_model,
             settings.surface_quantile,
             settings.surface_tau,
@@ -231,7 +234,8 @@ def _surface_row(
     try:
         target, found = surface(proxies, fills, slice(None))
         target_flipped, _ = surface(flipped, fills_flipped, slice(None, None, -1))
-        return target, target_flipped, describe(row, proxies, found, model.known_kind())
+        told = describe_nothing(row) if found is None else describe(row, proxies, found, model.known_kind())
+        return target, target_flipped, told
     except ValueError as error:
         raise ValueError(f"group {row.group_id}: {error}") from None
 

@@ -33,6 +33,7 @@ ONLY_PARSED = {  # the start of a command: why it is not run here
     "torchrun": "needs several GPUs; tests/training/test_resume.py runs both launchers",
     "ACCELERATE_USE_CPU=true torchrun": "starts processes; tests/training/test_resume.py runs both launchers",
     "gift-peft train --config examples/": "needs a large model",
+    "gift-peft capture": "needs a camera; tests/prepare/test_capture_verb.py has clips",
     "gift-peft train --config run.yaml": "the file is the reader's",
     "gift-peft prepare RAW gift-i --layout": "needs files in that layout; tests/captures/test_foreign.py has them",
     "gift-peft predict rgb": "needs files of a sensor; tests/deploy/test_predict_metric.py has them",

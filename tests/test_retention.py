@@ -4,7 +4,7 @@ import logging
 
 import pytest
 import torch
-from helpers.group_tools import Toy, gradients, group, largest_error, toy
+from helpers.group_tools import Toy, autograd_gradients, gift_model, gradients, group, largest_error, toy
 from torch import nn
 
 from gift_peft import memory
@@ -236,6 +236,23 @@ def test_micro_batches_take_the_whole_group_or_an_even_number_that_fits(room, mo
     assert step.micro_batch_size == chosen and largest_error(gradients(model), want) == 0
     kept = 18 - output.forwards
     assert kept == 9 if room >= 9 else kept + 2 * (chosen - 2) <= room
+
+
+@pytest.mark.parametrize(("room", "cut"), [(0, 2), (4, 4), (7, 4), (9, 9)])
+def test_the_cut_of_auto_has_the_gradient_of_one_graph(room, cut, monkeypatch):
+    """In float64; to the bit what a full graph gives where the cut is the whole group."""
+    data, model = group(9), gift_model()
+    _, want = autograd_gradients(model, 9, *data)
+    monkeypatch.setattr(GraphBudget, "images", lambda self, pixel_values, canvas: room)
+    results = {}
+    for name, options in {"auto": ("auto",), "full": (9, 9)}.items():
+        model.zero_grad(set_to_none=True)
+        step = GroupStep(model, 0.8, 1.5, *options)
+        step.accumulate(*data)
+        results[name] = gradients(model)
+        assert largest_error(results[name], want) < 1e-10
+        assert step.micro_batch_size == (cut if name == "auto" else 9)
+    assert cut < 9 or largest_error(results["auto"], results["full"]) == 0
 
 
 def test_the_largest_group_decides_and_the_choice_stays(monkeypatch):

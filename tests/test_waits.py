@@ -19,6 +19,7 @@ from gift_peft.training.loop import _update
 from gift_peft.training.objectives import Consensus, Loaded
 from gift_peft.training.speed import make_adam
 from gift_peft.training.start import agree
+from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
 READS = ("_local_scalar_dense", "item", "nonzero", "_unique", "unique_", "masked_select", "equal", "is_nonzero")
 
@@ -125,6 +126,41 @@ def test_one_process_waits_twice(num_images, valid, retain):
 def test_several_processes_wait_three_times(num_images):
     """And for whether one of them was asked to stop."""
     assert len(waits_of_an_update(num_images, 2, True, 0)) == 3
+
+
+@pytest.mark.parametrize("valid", [False, True])
+@pytest.mark.parametrize("num_images", [1, 4, 9])
+def test_surface_targets_wait_once(num_images, valid):
+    """And once more for the weights, as every update."""
+    pixels, mask, target, there = group(num_images, torch.float32)
+    step = SurfaceStep(PredictedDepth(Toy().to("meta")), micro_batch_size=4)
+    waits = Waits()
+    with waits:
+        arrived = [part.to("meta", non_blocking=True) for part in (pixels, mask, target)]
+        output = step.accumulate(*arrived, there.to("meta", non_blocking=True) if valid else None)
+    assert len(waits.seen) == 1 and all(isinstance(value, float) for value in output)
+
+
+class OnlyFloat32(TorchDispatchMode):
+    """Apple's GPUs: no operator may make a float64 tensor of the device."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        output = function(*args, **(kwargs or {}))
+        for tensor in tree_flatten(output)[0]:
+            if isinstance(tensor, torch.Tensor) and tensor.is_meta and tensor.dtype == torch.float64:
+                raise TypeError(f"{function}: this device has no float64")
+        return output
+
+
+@pytest.mark.parametrize("target", ["consensus", "surface"])
+def test_an_update_makes_no_float64_on_the_device(target):
+    with OnlyFloat32():
+        if target == "consensus":
+            assert waits_of_an_update(9, 1, True, 4)
+        else:
+            test_surface_targets_wait_once(4, True)
+        with pytest.raises(TypeError, match="no float64"):
+            torch.ones(2, device="meta").double()
 
 
 @pytest.mark.parametrize(

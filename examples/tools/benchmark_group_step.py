@@ -1,6 +1,6 @@
 """How fast one epoch of GIFT is: pair traversal, the paper's snapshot-and-replay, the full graph, and this package.
 
-    OMP_NUM_THREADS=2 python examples/tools/benchmark_group_step.py --out docs
+    OMP_NUM_THREADS=2 python examples/tools/benchmark_group_step.py --compile --out docs
 
 measures, side by side on one machine, with one loader, loss and optimizer (paper, supplement B):
   (a) pairs    naive pair traversal: an update per pair of a group
@@ -26,14 +26,13 @@ from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
-import numpy as np
 import torch
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
-from benchmark.epoch import Stratum, Timing, make_strata
-from benchmark.models import CONFIGS, PAPER_MINUTES, Config
+from benchmark.epoch import GROUP_SIZES, Stratum, Timing, make_strata
+from benchmark.inputs import write_base, write_groups
+from benchmark.models import CONFIGS, PAPER_MINUTES
 from benchmark.report import METHODS, TITLE, machine, replace_section, to_markdown
-from PIL import Image
 
 from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.dataset.gift_i import load_gift_i
@@ -75,7 +74,8 @@ class Bench:
         rows = load_gift_i(folder / "raw", "train", teacher=base, size=config.size)
         self.index = {len(names): i for i, names in enumerate(rows["image_names"])}
         self.groups = PreparedGroups(rows, processor, config.size, cache_dir=folder / "cache")
-        self.step = GroupStep(self.model, micro_batch_size="auto", accelerator=self.accelerator)  # as it has learned
+        self.step = GroupStep(self.model, micro_batch_size="auto", accelerator=self.accelerator)
+        self.step.choose_micro_batch_size(inputs_of(self.groups[0]), largest=max(GROUP_SIZES))  # as `train` does
         self.replay = GroupStep(self.model, retain=0, accelerator=self.accelerator)
         self.pair = GroupStep(self.model, retain=2, accelerator=self.accelerator)
 
@@ -86,11 +86,7 @@ class Bench:
         return {"a": self.pair, "b": self.replay, "d": self.step}[method]
 
     def update(self, step: GroupStep, feed: Iterator[Group], phases: Phases) -> GroupStepOutput:
-        def load() -> GroupInputs:
-            group = next(feed)
-            return GroupInputs(group.pixel_values, group.mask, group.target, group.valid, group.names)
-
-        return profiling.timed_update(step, self.optimizer, load, phases)
+        return profiling.timed_update(step, self.optimizer, lambda: inputs_of(next(feed)), phases)
 
     def time(self, method: str, size: int, max_pairs: int) -> Timing:
         """The updates of one group by one method; of (a) at most `max_pairs`, spread over the group."""
@@ -111,34 +107,16 @@ class Bench:
         return Timing(time.perf_counter() - started, phases.seconds, 2 * len(pairs), len(pairs))
 
 
+def inputs_of(group: Group) -> GroupInputs:
+    """Checked, as the loader's threads do it."""
+    return GroupInputs(group.pixel_values, group.mask, group.target, group.valid, group.names)
+
+
 def pick(group: Group, indices: list[int]) -> Group:
     """Some images of a group."""
     valid = None if group.valid is None else group.valid[indices]
     names = [group.names[i] for i in indices]
     return Group(group.group_id, names, group.pixel_values[indices], group.mask[indices], valid, group.target[indices])
-
-
-def write_base(config: Config, folder: Path) -> None:
-    from transformers import DPTImageProcessor
-
-    config.build().save_pretrained(folder)
-    size = {"height": config.size[0], "width": config.size[1]}
-    mean, std = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
-    DPTImageProcessor(size=size, image_mean=mean, image_std=std, resample=3).save_pretrained(folder)
-
-
-def write_groups(root: Path, sizes: list[int]) -> None:
-    """A raw tree with one group of each size: 480x640 JPEG photographs of nothing, one target per group."""
-    for size in sizes:
-        rng = np.random.default_rng(size)
-        folder = root / "train" / f"group_{size:02d}"
-        (folder / "masks").mkdir(parents=True)
-        mask = np.zeros((480, 640), np.uint8)
-        mask[120:360, 160:480] = 255  # a quarter of the picture
-        for index in range(size):
-            noise = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)
-            Image.fromarray(noise).resize((640, 480), Image.Resampling.BICUBIC).save(folder / f"{index:02d}.jpg")
-            Image.fromarray(mask).save(folder / "masks" / f"{index:02d}.png")
 
 
 # ---- measurements ----
@@ -172,7 +150,7 @@ def measure_epochs(bench: Bench, strata: list[Stratum], repeats: int, max_pairs:
 
 
 def check_gradients(bench: Bench, size: int) -> dict[str, float]:
-    """(d) against (b), largest difference, and (c) against (b), relative L2 norm, with a perturbed adapter."""
+    """With a perturbed adapter: (d) against (c), relative L2 norm, and against (b) with the micro-batches of (b)."""
     group = bench.groups[bench.index[size]]
     weights = [p for p in bench.model.parameters() if p.requires_grad]
     before = [p.detach().clone() for p in weights]
@@ -181,16 +159,20 @@ def check_gradients(bench: Bench, size: int) -> dict[str, float]:
     with torch.no_grad():
         for p in weights:
             p += 0.02 * torch.randn(p.shape, generator=generator).to(p)
-    for method in "bcd":
+    same_cut = GroupStep(bench.model, micro_batch_size=2, accelerator=bench.accelerator)
+    for method, step in {**{m: bench.step_of(m, size) for m in "bcd"}, "d as b": same_cut}.items():
         bench.model.zero_grad(set_to_none=True)
-        bench.step_of(method, size).accumulate(group.pixel_values, group.mask, group.target)
+        step.accumulate(group.pixel_values, group.mask, group.target)
         gradients[method] = torch.cat([p.grad.flatten() for p in weights if p.grad is not None])
     bench.model.zero_grad(set_to_none=True)
     with torch.no_grad():
         for p, value in zip(weights, before, strict=True):
             p.copy_(value)
-    b, c, d = (gradients[method] for method in "bcd")
-    return {"d_minus_b_max": (d - b).abs().max().item(), "c_to_b_relative_l2": ((c - b).norm() / b.norm()).item()}
+    b, c, d, same = (gradients[method] for method in ("b", "c", "d", "d as b"))
+    return {
+        "d_minus_b_max": (same - b).abs().max().item(),
+        "d_to_c_relative_l2": ((d - c).norm() / c.norm()).item(),
+    }
 
 
 def measure_loader(bench: Bench, seconds: float) -> float:
@@ -321,7 +303,9 @@ def benchmark(name: str, args: argparse.Namespace, folder: Path) -> dict:
     }
     result["loader_images_per_second"] = measure_loader(bench, seconds=2)
     result["loader_to_step"] = result["loader_images_per_second"] / (images / median(epochs["d"]))
-    result["options_seconds"] = measure_options(bench, args.option_size, min(3, args.repeats), args.compile)
+    result["micro_batch_size"] = bench.step.micro_batch_size
+    compiled = args.compile and name != "tiny"  # whose blocks are too small to gain anything
+    result["options_seconds"] = measure_options(bench, args.option_size, min(3, args.repeats), compiled)
     if config.device == "cuda":
         result["memory"] = measure_memory(bench)
     else:
@@ -350,7 +334,7 @@ def summarize(timings: list[Timing], epochs: dict, backwards: int, flops, rate: 
     total = sum(seconds)
     phases = {name: sum(timing.phases[name] for timing in timings) / total for name in PHASES}
     ratios = {}
-    for other in "ab":
+    for other in [other for other in "abc" if other in epochs]:
         values = sorted(theirs.seconds / ours.seconds for theirs, ours in zip(epochs[other], timings, strict=True))
         ratios[f"faster_than_{other}"] = [statistics.median(values), values[0], values[-1]]
     return {

@@ -1,9 +1,10 @@
 """How fast an epoch is with surface targets, beside the paper's schedule and the package's own default for groups.
 
-    OMP_NUM_THREADS=2 python examples/tools/benchmark_surface.py
+    OMP_NUM_THREADS=2 python examples/tools/benchmark_surface.py --out docs
 
 The same images of the embedded dataset in one run, in turn within each repeat: (b) the paper's schedule, `--retain 0`
 with micro-batches of 2; (d) what `gift-peft train` does; (e) `--target surface`, batches of 4 images of any groups.
+(d) and (e) take as many images per forward as memory allows.
 Then what the targets cost once, with and without fills, in epochs of (e), and the memory of one update.
 """
 
@@ -17,13 +18,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from benchmark.report import machine
+from benchmark.report import machine, measured_with, replace_section
 from tqdm import tqdm
 
 from gift_peft import GroupStep, get_gift_model, load_gift_i
 from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.dataset.rows import parsed
 from gift_peft.dataset.writer import write_gift_i
+from gift_peft.group_inputs import GroupInputs
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.training import profiling
 from gift_peft.training.speed import make_adam
@@ -31,6 +33,8 @@ from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 from gift_peft.training.teacher import make_proxies
 
 SIZE, BATCH = (112, 140), 4
+TITLE = "Surface targets beside groups"
+NAMES = {"b": "paper's schedule", "d": "gift-peft default, consensus", "e": "surface targets"}
 
 
 class Epochs:
@@ -49,9 +53,12 @@ class Epochs:
         self.images = [torch.cat(parts) for parts in zip(*self.groups, strict=True)]
         self.steps = {
             "b": GroupStep(self.network, retain=0),
-            "d": GroupStep(self.network),
-            "e": SurfaceStep(PredictedDepth(self.network), micro_batch_size=BATCH),
+            "d": GroupStep(self.network, micro_batch_size="auto"),
+            "e": SurfaceStep(PredictedDepth(self.network)),
         }
+        largest = max(len(pixels) for pixels, *_ in self.groups)
+        self.steps["d"].choose_micro_batch_size(GroupInputs(*self.groups[0]), largest)
+        self.steps["e"].choose_micro_batch_size(self.images[0][:1], BATCH)
 
     def __call__(self, method: str) -> float:
         """Seconds of one epoch."""
@@ -92,42 +99,56 @@ def seconds_of_targets(base: Path, groups: list, fills: int | None) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--groups", type=int, default=48)
+    parser.add_argument("--groups", type=int, default=32)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--out", type=Path, help="folder of benchmark.md, which gets the tables; default: print only")
     args = parser.parse_args()
+    lines = [f"{measured_with(machine())}", ""]
     demo = Path(str(files("gift_peft.demo")))
     rows = parsed(load_gift_i(demo / "gift-i", "train"))
     groups = [rows[index] for index in range(0, len(rows), max(1, len(rows) // args.groups))][: args.groups]
     epochs = Epochs(demo / "base", groups)
-    facts = machine()
-    print(f"{facts['cpu']}, {facts['threads']} threads, load {facts['load_at_start']:.1f}, torch {facts['torch']}")
-    print(f"{len(groups)} groups, {len(epochs.images[0])} images at 112x140, {args.repeats} repeats\n")
+    lines += [
+        f"The embedded base on {len(groups)} of the embedded groups, {len(epochs.images[0])} images at 112x140, "
+        f"{args.repeats} repeats: medians with the smallest and largest, ratios within a repeat.",
+        "",
+        "| | s per epoch | faster than (b) |",
+        "|---|---:|---:|",
+    ]
+    seconds = measure_epochs(epochs, args.repeats)
+    for method, taken in seconds.items():
+        ratios = sorted(b / own for b, own in zip(seconds["b"], taken, strict=True))
+        lines.append(
+            f"| ({method}) {NAMES[method]} | {statistics.median(taken):.2f} ({min(taken):.2f}-{max(taken):.2f}) "
+            f"| {statistics.median(ratios):.2f} ({ratios[0]:.2f}-{ratios[-1]:.2f}) |"
+        )
+    epoch = statistics.median(seconds["e"])
+    lines += ["", "| once, before the training | s | epochs of (e) |", "|---|---:|---:|"]
+    for name, fills in {"proxies alone": None, "surface targets, no fills": 0, "surface targets, 6 fills": 6}.items():
+        once = seconds_of_targets(demo / "base", groups, fills)
+        lines.append(f"| {name} | {once:.1f} | {once / epoch:.1f} |")
+    lines += ["", "| peak memory of an update (MiB) | 4 images | 9 images | 55 images |", "|---|---:|---:|---:|"]
+    epochs.memory(4)  # allocations that stay
+    peaks = {count: epochs.memory(count) for count in (4, 9, 55)}
+    for method, name in NAMES.items():
+        cells = " | ".join(f"{peaks[count][method] / 2**20:.0f}" for count in peaks)
+        lines.append(f"| ({method}) {name} | {cells} |")
+    text = "\n".join(lines)
+    print(text)
+    if args.out:
+        replace_section(args.out / "benchmark.md", TITLE, text)
+
+
+def measure_epochs(epochs: Epochs, repeats: int) -> dict[str, list[float]]:
+    """Seconds per epoch, in turn."""
     seconds: dict[str, list[float]] = {method: [] for method in epochs.steps}
-    for repeat in tqdm(range(args.repeats + 1), "epochs", unit="repeat"):
+    for repeat in tqdm(range(repeats + 1), "epochs", unit="repeat"):
         order = list(seconds)
         for method in order[repeat % 3 :] + order[: repeat % 3]:
             taken = epochs(method)
             if repeat:  # the first warms up
                 seconds[method].append(taken)
-    print("| | seconds per epoch | faster than (b) |\n|---|---:|---:|")
-    names = {"b": "paper's schedule", "d": "gift-peft default, consensus", "e": "surface targets"}
-    for method, taken in seconds.items():
-        ratios = sorted(b / own for b, own in zip(seconds["b"], taken, strict=True))
-        print(
-            f"| ({method}) {names[method]} | {statistics.median(taken):.2f} ({min(taken):.2f}-{max(taken):.2f}) "
-            f"| {statistics.median(ratios):.2f} ({ratios[0]:.2f}-{ratios[-1]:.2f}) |"
-        )
-    epoch = statistics.median(seconds["e"])
-    plain = seconds_of_targets(demo / "base", groups, None)
-    print(f"\nProxies alone: {plain:.1f} s, {plain / epoch:.1f} epochs of (e)")
-    for fills in (0, 6):
-        once = seconds_of_targets(demo / "base", groups, fills)
-        print(f"With surface targets, {fills} fills: {once:.1f} s, {once / epoch:.1f} epochs of (e)")
-    print("\n| peak memory of an update (MiB) | 4 images | 9 images | 55 images |\n|---|---:|---:|---:|")
-    epochs.memory(4)  # allocations that stay
-    peaks = {count: epochs.memory(count) for count in (4, 9, 55)}
-    for method in names:
-        print(f"| ({method}) | " + " | ".join(f"{peaks[count][method] / 2**20:.0f}" for count in peaks) + " |")
+    return seconds
 
 
 if __name__ == "__main__":

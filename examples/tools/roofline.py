@@ -1,6 +1,6 @@
 """How long an epoch would take on a GPU that nobody has here: arithmetic and traffic counted, rates put in.
 
-    python examples/tools/roofline.py --gpu h200
+    python examples/tools/roofline.py --out docs
     python examples/tools/roofline.py --gpu rtx-4090 --models depth-anything-v2-large --micro_batch_size 2
 
 Estimates, not measurements. A forward and a backward of one image run on tensors without content; each matrix product,
@@ -13,11 +13,13 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from benchmark.epoch import GROUP_SIZES
 from benchmark.models import CONFIGS
+from benchmark.report import replace_section
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -27,6 +29,7 @@ from torch.utils.flop_counter import flop_registry
 from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.memory import CUDA_MARGIN, micro_batch_for
 
+TITLE = "Estimates for GPUs"
 BACKBONES = ("depth-anything-v2-large", "vggt-1b", "metric3d-v2-giant2")
 HALF = 0.5  # counted in float32, computed in bf16
 
@@ -191,22 +194,33 @@ def main() -> None:
     parser.add_argument("--models", choices=list(CONFIGS), nargs="+", default=list(BACKBONES))
     parser.add_argument("--micro_batch_size", type=int, help="default: what auto takes")
     parser.add_argument("--launch_microseconds", type=float, default=10.0, help="host time per kernel")
+    parser.add_argument("--out", type=Path, help="folder of benchmark.md, which gets the table; default: print only")
     args = parser.parse_args()
-    print("Estimates (examples/tools/roofline.py), nothing was measured; host: what launching the kernels takes.\n")
-    print("| model | GPU | TFLOP per image, forward / backward | kernels | GiB a graph | batch | kept | s per epoch |")
-    print("|---|---|---:|---:|---:|---:|---:|---:|")
+    lines = [
+        "**Nothing here was measured.** `python examples/tools/roofline.py` counts the arithmetic, the memory traffic "
+        "and the kernels of one image on tensors without content, and divides by what such kernels reach on a GPU. "
+        f"Host: what launching the kernels takes at {args.launch_microseconds:g} microseconds each. The epoch is "
+        "GIFT-I's, 3,268 images.",
+        "",
+        "| model | GPU | TFLOP per image, forward / backward | kernels | GiB a graph | batch | kept | s per epoch |",
+        "|---|---|---:|---:|---:|---:|---:|---:|",
+    ]
     for name in args.models:
         with torch.device("meta"):
             model = get_gift_model(CONFIGS[name].build()).eval()
         counted = count(model, CONFIGS[name].size)
         for gpu in args.gpu:
             result = epoch_seconds(counted, GPUS[gpu], args.launch_microseconds * 1e-6, args.micro_batch_size)
-            print(
+            lines.append(
                 f"| {name} | {gpu} | {counted.forward.flops() / 1e12:.2f} / {counted.backward.flops() / 1e12:.2f} | "
                 f"{counted.forward.kernels} + {counted.backward.kernels} | {counted.graph / 2**30:.2f} | "
                 f"{result['micro_batch']} | {result['kept']:.0%} | "
                 f"{result['device']:.0f} (host {result['host']:.0f}) |"
             )
+    text = "\n".join(lines)
+    print(text)
+    if args.out:
+        replace_section(args.out / "benchmark.md", TITLE, text)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from gift_peft.options import did_you_mean, package_version, run_verb
 VERBS = {
     "demo": ("demo.demo_verb", "train and evaluate the embedded model on the embedded groups"),
     "prepare": ("prepare.prepare_verb", "from a folder of photos to a checked dataset, with a report"),
+    "capture": ("prepare.capture_verb", "a coach at the camera, which takes the photos of a group by itself"),
     "synthesize": ("prepare.synthesize_verb", "groups from single photos: painted copies of each"),
     "export": ("dataset.export_verb", "a dataset as parquet shards with a card, to share or stream"),
     "proxies": ("training.proxies_verb", "keep the frozen model's predictions for a dataset"),

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gift_peft.losses import Pairs, require_finite
+from gift_peft.losses import Pairs, name_infinite, require_finite
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,7 @@ class GroupInputs:
 
         The cause before its consequences.
         """
-        if not all(finite):
-            index = [bool(flag) for flag in finite].index(False)
-            image = f"image {index}" if self.names is None else f"{self.names[index]} (image {index})"
-            raise ValueError(f"the prediction of {image} has NaN or infinite values")
+        name_infinite(finite, "the prediction", self.names)
         if not math.isfinite(loss):  # differences of finite predictions overflow; their signs do not
             raise ValueError("the loss of this group is NaN or infinite")
         if not math.isfinite(gradient):

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from gift_peft.group_inputs import GroupInputs, check_lambdas
-from gift_peft.losses import GiftLoss, Pairs, gift_terms
+from gift_peft.losses import GiftLoss, Pairs, are_finite, gift_terms
 from gift_peft.memory import FrozenCasts, GraphBudget, is_out_of_memory, local_processes, release_memory
 from gift_peft.replayable import check_replayable, check_watched, mixed_precision_of, watched
 
@@ -144,9 +144,7 @@ class GroupStep:
                 differentiate = partial(self._differentiate, canvas, target, mask, valid, group)
                 loss, gradient = self._recovering(differentiate, group, graphs)
             backward = partial(self._replay, parameters, group, batches, gradient, graphs)
-            low, high = canvas.detach().flatten(1).aminmax(dim=1)  # both are NaN if one value is
-            finite = low.isfinite() & high.isfinite()
-            facts = [num_retained, loss.total, loss.consistency, loss.distillation, finite]
+            facts = [num_retained, loss.total, loss.consistency, loss.distillation, are_finite(canvas)]
             values = self._add_gradients(parameters, backward, facts, group)
         kept, *terms = values[:4]
         cpu = [torch.tensor(term, dtype=canvas.dtype) for term in terms]

@@ -107,6 +107,20 @@ def gift_terms(
     return GiftLoss(lambda_c * consistency + lambda_d * distillation, consistency, distillation, pairs.num_pairs)
 
 
+def image_terms(depth: Tensor, target: Tensor, mask: Tensor, valid: Tensor | None = None) -> Tensor:
+    """(N,2): of each image alone, `masked_l1` to `target` inside its target region, and `self_distillation_loss`.
+
+    Args: as `self_distillation_loss`, without its checks: nothing here waits for the device. A region without a pixel
+    gives 0. NaN in, NaN out.
+    """
+    depth, target = _promote(depth, target)
+    target = target.detach()
+    inside, other = _target_region(mask, valid), _other_region(mask, valid).flatten(1)
+    first = _absolute(depth - target, inside).flatten(1).sum(1) / inside.flatten(1).sum(1).clamp(min=1)
+    second = _DistanceToTarget.apply(depth.flatten(1), target.flatten(1), other, other.sum(1))
+    return torch.stack([first, 2 * second], 1)
+
+
 class Pairs(NamedTuple):
     """All of Eq. 2 that target regions alone decide, on the CPU: which pixels count in which pair.
 
@@ -204,12 +218,21 @@ def prediction_spread(depth: Tensor, valid: Tensor | None = None) -> float:
     return float(high - low)
 
 
+def are_finite(values: Tensor) -> Tensor:
+    """(N,) bool: which images of `values` (N,...) hold finite values only."""
+    low, high = values.detach().flatten(1).aminmax(dim=1)  # both are NaN if one value is; isfinite would copy them all
+    return low.isfinite() & high.isfinite()
+
+
 def require_finite(values: Tensor, what: str, names: Sequence[str] | None = None) -> None:
     """Raise ValueError naming the first image of `values` (N,...) that holds a NaN or infinite value."""
-    low, high = values.flatten(1).aminmax(dim=1)  # both are NaN if one value is; isfinite(values) would copy them all
-    finite = low.isfinite() & high.isfinite()
-    if not finite.all():
-        index = int((~finite).nonzero()[0])
+    name_infinite(are_finite(values).tolist(), what, names)
+
+
+def name_infinite(finite: Sequence[float], what: str, names: Sequence[str] | None = None) -> None:
+    """Raise ValueError naming the first image whose flag is not set."""
+    if not all(finite):
+        index = [bool(flag) for flag in finite].index(False)
         image = f"image {index}" if names is None else f"{names[index]} (image {index})"
         raise ValueError(f"{what} of {image} has NaN or infinite values")
 

@@ -218,8 +218,6 @@ def run(argv: Sequence[str]) -> int:
         parser.error("one of --base, --adapter and --deployed is required")
     check_metric_options(parser, args)
     if args.video is not None:
-        if args.deployed is not None:
-            parser.error("--video takes --base or --adapter, not --deployed")
         return run_video(args)
     reasons: list[str] = []
     outputs = make_outputs(args)

@@ -185,6 +185,17 @@ def test_saving_replaces_the_whole_folder(model, tmp_path):
         save_adapter(model, tmp_path / "file", "someone/base")
 
 
+def test_an_adapter_is_on_the_disk_before_it_has_its_name(model, tmp_path, monkeypatch):
+    """Or a power cut leaves a folder of empty files."""
+    events, fsync, replace = [], os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda fd: events.append(os.fstat(fd).st_ino) or fsync(fd))
+    monkeypatch.setattr(os, "replace", lambda source, target: events.append(str(target)) or replace(source, target))
+    save_adapter(get_gift_model(model), tmp_path / "adapter", "someone/base")
+    named = events.index(str(tmp_path / "adapter"))
+    files = {path.stat().st_ino for path in (tmp_path / "adapter").rglob("*")}
+    assert files and files <= set(events[:named]) and tmp_path.stat().st_ino in events[named:]
+
+
 def test_failed_save_keeps_the_old_folder(model, tmp_path):
     model = get_gift_model(model)
     save_adapter(model, tmp_path / "adapter", "someone/base")

@@ -1,5 +1,8 @@
 """Clips are decoded upright, in order and with their times, and what is no readable clip says so in one line."""
 
+import shutil
+import subprocess
+
 import cv2
 import numpy as np
 import pytest
@@ -87,6 +90,39 @@ def test_a_damaged_tail_ends_the_clip_and_is_told(tmp_path):
     clip = Clip(path)
     frames = list(clip.frames())
     assert 5 < len(frames) < 25 and numbers(frames) == list(range(len(frames)))
+
+
+def by_ffmpeg(path, *words):
+    """A clip of numbered frames again, with other options."""
+    source = write(path.with_name("source.avi"), codec="MJPG")
+    subprocess.run(["ffmpeg", "-loglevel", "error", "-y", "-i", source, *words, path], check=True)
+    return path
+
+
+needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg to make the clip")
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_variable_frame_rate_keeps_the_times(tmp_path, suffix):
+    """Of 15 frames a second, every third from the second second on, as phones do in the dark."""
+    chosen = "select='lt(t,1)+not(mod(n,3))'"
+    path = by_ffmpeg(tmp_path / f"a.{suffix}", "-vf", chosen, "-fps_mode", "vfr", "-c:v", "mpeg4", "-q:v", "2")
+    frames = list(Clip(path).frames())
+    expected = [index for index in range(30) if index < 15 or index % 3 == 0]
+    assert numbers(frames) == expected
+    assert np.allclose([frame.seconds for frame in frames], np.array(expected) / RATE, atol=0.002)
+
+
+@needs_ffmpeg
+def test_the_frames_before_a_damaged_tail_of_mp4_are_read(tmp_path):
+    path = by_ffmpeg(tmp_path / "a.mp4", "-c:v", "mpeg4", "-q:v", "2", "-movflags", "+faststart")
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 6 // 10])
+    clip = Clip(path)
+    frames = list(clip.frames())
+    assert 5 < len(frames) < 25 and numbers(frames) == list(range(len(frames)))
+    assert clip.frames_stated == 30 and clip.is_cut_short(len(frames))
 
 
 def test_fewer_frames_than_stated_are_a_cut(tmp_path):

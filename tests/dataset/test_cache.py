@@ -15,6 +15,8 @@ from gift_peft.dataset import cache as module
 from gift_peft.dataset import rows as rows_module
 from gift_peft.dataset.cache import GroupCache
 from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.dataset.loader import PreparedGroups, PreparedImages
+from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.training.teacher import make_proxies
 
@@ -62,15 +64,22 @@ def test_the_second_reading_decodes_nothing_and_has_the_same_bits(raw, base_dir,
         assert_equal_groups(again.read(0), want)
 
 
-@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux tells what is mapped")
+def is_mapped(tensor, folder) -> bool:
+    """Whether a tensor's memory is that of a file in this folder: pages that are read when asked for."""
+    maps = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(folder) in line]
+    starts = [tuple(int(side, 16) for side in line[0].split("-")) for line in maps]
+    return any(start <= tensor.data_ptr() < end for start, end in starts)
+
+
+only_linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux tells what is mapped")
+
+
+@only_linux
 def test_masks_stay_mapped_to_the_file(raw, tmp_path):
     cache = open_cache(raw, tmp_path / "cache")
     cache.read(0)
-    file = next((tmp_path / "cache").iterdir())
     group = cache.read(0)
-    maps = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(file) in line]
-    starts = [tuple(int(side, 16) for side in line[0].split("-")) for line in maps]
-    assert any(start <= group.mask.data_ptr() < end for start, end in starts)
+    assert is_mapped(group.mask, tmp_path / "cache") and not is_mapped(group.pixel_values, tmp_path)
 
 
 def test_entries_are_keyed_by_content_size_and_nothing_else(raw, tmp_path, no_decoding):
@@ -163,6 +172,37 @@ def test_a_stale_proxy_is_found_without_decoding(raw, base_dir, tmp_path):
     open_cache(raw, folder).read(0)  # the entry of the new picture
     with pytest.raises(ValueError, match=r"stale proxy .*scene\.safetensors: image 0\.png has changed"):
         open_cache(raw, folder, teacher=base_dir).read(0)
+
+
+@only_linux
+@pytest.mark.parametrize("count", [3, 12])
+def test_an_image_takes_the_memory_of_one_image_whatever_its_group(base_dir, tmp_path, count):
+    write_group(tmp_path / "raw/train/scene", count, 0)
+    surface = SurfaceSettings(fills=0)
+    make_proxies(base_dir, tmp_path / "raw", size=SIZE, surface=surface)
+    rows = load_gift_i(tmp_path / "raw", "train", teacher=base_dir, size=SIZE, surface=surface)
+    whole = PreparedGroups(rows, tiny_processor(), SIZE, 0, tmp_path / "cache")[0]  # and fills the cache
+    images = PreparedImages(PreparedGroups(rows, tiny_processor(), SIZE, 0, tmp_path / "cache"))
+    assert len(images) == count
+    for index in (0, count - 1):
+        image = images.read(index)
+        for name in ("pixel_values", "mask", "surface_target"):
+            tensor = getattr(image, name)
+            assert torch.equal(tensor[0], getattr(whole, name)[index]), name
+            own = tensor.untyped_storage().nbytes() == tensor.element_size() * tensor[0].numel()
+            assert own or is_mapped(tensor, tmp_path), name
+        assert image.pixel_values.untyped_storage().nbytes() == 12 * SIZE[0] * SIZE[1]
+
+
+def test_threads_that_want_the_same_group_decode_it_once(raw, tmp_path, monkeypatch):
+    calls, real = [], module.resize_pictures
+    monkeypatch.setattr(module, "resize_pictures", lambda *args: calls.append(1) or real(*args))
+    cache = open_cache(raw, tmp_path / "cache")
+    with ThreadPoolExecutor(4) as pool:
+        groups = list(pool.map(lambda _: cache.read(0), range(8)))
+    assert len(calls) == 1
+    for group in groups:
+        assert_equal_groups(group, groups[0])
 
 
 def test_without_a_folder_every_reading_decodes(raw, no_decoding):

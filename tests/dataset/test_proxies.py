@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+from types import SimpleNamespace
 
 import pytest
 import safetensors.torch
@@ -18,7 +19,7 @@ from gift_peft.dataset.proxies import SurfaceSettings, default_proxies_dir, read
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.models import loading
 from gift_peft.models.identity import teacher_id, teacher_revision
-from gift_peft.training import teacher
+from gift_peft.training import shares, teacher
 from gift_peft.training.teacher import make_proxies
 
 pytestmark = pytest.mark.usefixtures("fresh_cache")
@@ -296,17 +297,17 @@ def test_the_processor_that_accelerate_was_told_is_used(raw_tree, base_dir, monk
 
 
 def test_a_folder_that_cannot_be_written_is_told_like_any_error(raw_tree, base_dir, monkeypatch):
-    """In all processes: see the two processes above for `_raise_everywhere`."""
+    """In all processes, which hear of it before any goes on."""
     told = []
-    raise_everywhere = teacher._raise_everywhere
-    monkeypatch.setattr(teacher, "_raise_everywhere", lambda *args: told.append(args[0]) or raise_everywhere(*args))
+    monkeypatch.setattr(shares, "gather_object", lambda items: told.extend(items) or items)
+    two = SimpleNamespace(process_index=0, num_processes=2, is_main_process=True, device=torch.device("cpu"))
 
     def refuse(path, *args):
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(teacher, "write_proxies", refuse)
     with pytest.raises(PermissionError, match=r"scene_0\.safetensors") as excinfo:
-        make_proxies(base_dir, raw_tree, size=SIZE)
+        make_proxies(base_dir, raw_tree, size=SIZE, accelerator=two)
     assert told == [excinfo.value]
 
 

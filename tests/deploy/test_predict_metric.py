@@ -106,9 +106,9 @@ def test_sizes_may_differ_and_without_masks_the_fit_finds_the_glass(demo, work, 
         (lambda d: d[:, :70], ["60x70", "the photo 60x80", "another camera or crop"]),
         (lambda d: np.zeros_like(d), ["no depth at all"]),
         (lambda d: np.maximum(d // 1000, 1), ["taken as mm", "--sensor-unit m"]),
-        (lambda d: d[::-1, ::-1], ["depth/0.png: "]),
+        (lambda d: np.where(d > 0, d.max() + 300 - d, 0), ["depth/0.png: ", "does not grow with the predicted depth"]),
     ],
-    ids=["another size", "all zero", "metres", "unregistered"],
+    ids=["another size", "all zero", "metres", "another scene"],
 )
 def test_a_wrong_sensor_is_one_line_and_the_other_photos_are_done(change, words, demo, work, capsys):
     values = np.asarray(Image.open("depth/0.png"))
@@ -135,6 +135,7 @@ def test_depth_that_is_moved_is_told(demo, work, capsys):
         (["rgb", "--pointcloud=ply", "--camera=nowhere.yaml"], "camera nowhere.yaml: no such file"),
         (["--video=nowhere.mp4"], "nowhere.mp4: no such clip"),
         (["--video=rgb/0.png.txt"], "not a clip that can be read"),
+        (["--video=rgb/0.png"], "rgb/0.png: a picture, not a clip; leave --video out"),
         (["--video=77"], "camera 77: it cannot be opened"),
     ],
 )

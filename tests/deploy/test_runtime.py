@@ -8,6 +8,7 @@ import sys
 from importlib.metadata import version
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -20,9 +21,11 @@ from torch.nn import functional as F
 from transformers import DPTImageProcessorPil
 
 from gift_peft import DepthModel
+from gift_peft.cli import main
 from gift_peft.deploy import runtime
 from gift_peft.deploy.bundle import _settings
 from gift_peft.deploy.deployed import DeployedModel
+from gift_peft.deploy.look_ahead import predict_ahead
 from gift_peft.deploy.runtime import Predictor, normalized, read_picture, resized
 from gift_peft.images import read_image
 from gift_peft.models.metric3d import Metric3DImageProcessorPil
@@ -165,6 +168,38 @@ def test_a_dial_brings_the_base_along(folder, photo, tmp_path):
     assert np.allclose(half, 1.5 * base, atol=1e-5) and np.abs(base).max() > 0.1
     full = DeployedModel(out).depth_at(photo)
     assert np.allclose(full, 2 * base, atol=1e-5)
+
+
+@pytest.mark.parametrize("dial", [True, False])
+def test_a_clip_through_a_deployed_folder(dial, folder, tmp_path, capsys):
+    frames = [np.full((64, 96, 3), shade, np.uint8) for shade in (60, 120, 200)]
+    writer = cv2.VideoWriter(str(tmp_path / "in.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 12.0, (96, 64))
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+    argv = ["predict", f"--video={tmp_path / 'in.mp4'}", f"--deployed={folder(dial=dial)}", "--batch-size=2"]
+    with pytest.raises(SystemExit) as end:
+        main([*argv, f"--out={tmp_path / 'out'}", *(["--adapter-scale=0.5"] if dial else [])])
+    assert not end.value.code, capsys.readouterr().err
+    capture = cv2.VideoCapture(str(tmp_path / "out" / "in_depth.mp4"))
+    there, frame = capture.read()
+    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 3
+    assert there and frame.shape == (64, (3 if dial else 2) * 96, 3)
+
+
+def test_several_pictures_of_a_deployed_model_go_through_it_at_once(folder, tmp_path):
+    files = [tmp_path / f"{index}.png" for index in range(3)]
+    for index, file in enumerate(files):
+        size = (45 + index, 61, 3)
+        Image.fromarray(np.random.default_rng(index).integers(0, 256, size, dtype=np.uint8)).save(file)
+    model = DeployedModel(folder(dial=True))
+    batches, run = [], model.predictor.predict
+    model.predictor.predict = lambda pixels, scale: batches.append((len(pixels), scale)) or run(pixels, scale)
+    results = list(predict_ahead(model, files, base_too=True, batch_size=2))
+    assert batches == [(2, None), (2, 0.0), (1, None), (1, 0.0)]
+    for file, result in zip(files, results, strict=True):
+        assert np.array_equal(result["own"], model.depth_at(file))
+        assert np.array_equal(result["base"], model.depth_at(file, base=True))
 
 
 def test_no_torch_is_imported(folder, photo, tmp_path):

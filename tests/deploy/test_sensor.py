@@ -85,6 +85,38 @@ def test_a_smooth_error_of_the_model_is_taken_off_inside_the_target_too():
     assert np.abs(filled.depth[mask] - depth[mask]).mean() < 0.4 * rough
 
 
+@pytest.mark.parametrize("kind", ["inverse_depth", "depth"])
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.005, 0.08), st.floats(-1, 3))
+def test_wrong_predictions_nearby_do_not_turn_the_fit(kind, seed, share, factor):
+    """On a plane a tilt explains what the prediction does: only what the few wrong pixels say tells the two apart."""
+    random = np.random.default_rng(seed)
+    row, column = np.mgrid[: SIZE[0], : SIZE[1]] / SIZE[1]
+    depth = 1 / (0.5 + random.uniform(0.3, 0.8) * row + random.uniform(-0.2, 0.2) * column)
+    mask = np.zeros(SIZE, bool)
+    mask[20:40, 30:55] = True
+    depth[mask] = depth[mask].min() * random.uniform(0.75, 0.95)  # stands on the table
+    prediction = predicted(depth, kind, 2.0, 0.1)
+    wrong = ~mask & (random.random(SIZE) < share)
+    prediction[wrong] = np.median(prediction) * factor
+    sensor = np.where(mask, 0, depth * (1 + 0.003 * random.standard_normal(SIZE)))
+    filled = fill_sensor_depth(prediction, sensor, mask, kind)
+    np.testing.assert_allclose(filled.depth[mask], depth[mask], rtol=0.015)
+
+
+def test_a_mask_that_is_too_small_leaves_glass_about_it_that_says_nothing_of_the_target():
+    row, column = np.mgrid[:120, :160] / 160
+    depth = 1 / (0.5 + 0.5 * row + 0.1 * column)
+    glass = np.zeros(depth.shape, bool)
+    glass[40:80, 60:110] = True
+    depth[glass] = depth[glass].min() * 0.9
+    sensor = np.where(glass, depth + 0.5, depth)
+    mask = np.zeros(depth.shape, bool)
+    mask[43:77, 63:107] = True
+    filled = fill_sensor_depth(predicted(depth, "inverse_depth", 2.0, 0.1), sensor, mask)
+    np.testing.assert_allclose(filled.depth[mask], depth[mask], rtol=0.015)
+
+
 def test_confidence_falls_with_distance_from_what_is_known_and_with_disagreement():
     depth, mask = scene(5)
     sensor = np.where(mask, 0, depth)

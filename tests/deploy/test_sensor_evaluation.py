@@ -127,6 +127,7 @@ def test_real_scenes_keep_the_sensor_outside_the_target(tmp_path):
     model = DepthModel(network, processor, (182, 322), "inverse_depth")
     report = evaluate_sensor(dataset, model, tmp_path / "sensor", progress=False)
     assert all(row["skipped"] is None for row in report.rows)
-    # The twins' own depth as prediction, with holes of theirs in it: better than what the sensor sees through.
-    assert report.summary["base"]["tom"]["rmse"] < 0.9 * report.summary["sensor"]["tom"]["rmse"]
+    # The twins' own depth as prediction gives their depth back, though holes of theirs are among what it is fitted to.
+    for row in report.rows:
+        assert row["base"]["tom"]["rmse"] < 0.3 * row["sensor"]["tom"]["rmse"], row
     assert report.summary["sensor"]["tom"]["rmse"] > 20 > 5 > report.summary["sensor"]["other"]["rmse"]

@@ -155,7 +155,7 @@ def test_the_benchmark_runs(tmp_path):
     assert forwards == {"a": 40678, "b": 6536, "c": 3268, "d": 3268}
     updates = {method: row["updates"] for method, row in tiny["methods"].items()}
     assert updates == {"a": 20339, "b": 353, "c": 353, "d": 353}
-    assert tiny["gradients"]["d_minus_b_max"] == 0 and tiny["gradients"]["c_to_b_relative_l2"] < 1e-3
+    assert tiny["gradients"]["d_minus_b_max"] == 0 and tiny["gradients"]["d_to_c_relative_l2"] < 1e-3
     own = tiny["memory"]["tensors_of_added_images"]
     for method in ("b", "d, at most 4 images retained"):
         peaks = tiny["memory"]["peaks"][method]

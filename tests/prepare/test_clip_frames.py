@@ -1,5 +1,7 @@
 """Frames of clips: each observation once, none while something moves, groups that end where the camera was pushed."""
 
+import re
+
 import numpy as np
 import pytest
 from helpers.clips import Making, pushed, views
@@ -130,6 +132,19 @@ def test_several_clips_are_one_scene_of_one_size(tmp_path):
     paths.append(other.write(tmp_path / "3.mp4"))
     with pytest.raises(ValueError, match=r"3\.mp4: frames of 160x120, and 0\.mp4 begins with 320x240"):
         choose_frames(paths)
+
+
+def test_a_damaged_tail_is_told_and_what_came_before_is_used(tmp_path):
+    pictures, mask = views(10, SIZE, 4)
+    made = Making(SIZE)
+    for picture in pictures:
+        made.hold(picture)
+    path = made.write(tmp_path / "a.avi", "MJPG")
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 6 // 10])
+    choice = choose_frames([path], lambda size: mask)
+    assert held(choice.poses[0].frames, made.holds) == [0, 1]
+    assert re.match(r"a\.avi is damaged: \d+ of 60 frames could be read", choice.notes[0])
 
 
 def test_a_clip_without_a_still_moment_says_so(tmp_path):

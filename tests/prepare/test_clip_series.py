@@ -4,61 +4,23 @@
 """
 
 import time
-from importlib.resources import files
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from helpers.clip_stills import distinct, real_stills, rendered_stills
 from helpers.clips import Making, pushed
-from PIL import Image
 
-from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.prepare.clip_frames import choose_frames
 
-SHARED = Path(__file__).parents[3] / "shared" / "data"
 SIZE = (270, 480)  # height, width
 CLIPS = 40
 
 pytestmark = pytest.mark.slow
 
 
-def at_size(picture: np.ndarray) -> np.ndarray:
-    """Scaled and cropped, (H, W, 3) or (H, W)."""
-    scale = max(SIZE[0] / picture.shape[0], SIZE[1] / picture.shape[1])
-    large = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return large[: SIZE[0], : SIZE[1]]
-
-
 @pytest.fixture(scope="module")
 def stills() -> list[tuple[list[np.ndarray], np.ndarray]]:
-    """Pictures of one pose, and a mask: the embedded rendered groups; real photos with other photos in the glass."""
-    found = []
-    for split in ("train", "validation"):
-        for row in load_gift_i(str(files("gift_peft") / "demo" / "gift-i"), split).select(range(12)):
-            pictures = [at_size(np.asarray(image)) for image in row["images"]]
-            mask = np.any([at_size(np.asarray(mask)) > 127 for mask in row["masks"]], axis=0)
-            found.append((pictures, mask))
-    pairs = [(folder / "transparent.jpg", folder / "mask.png") for folder in sorted(SHARED.glob("cleargrasp_d435/0*"))]
-    photos = [at_size(np.asarray(Image.open(photo))) for photo, _ in pairs]
-    photos += [at_size(np.asarray(Image.open(path))) for path in sorted(SHARED.glob("middlebury*/*.png"))]
-    for index, (_, mask) in enumerate(pairs):
-        inside = at_size(np.asarray(Image.open(mask).convert("L"))) > 127
-        inside = cv2.dilate(inside.astype(np.uint8), np.ones((15, 15))) > 0
-        for turn in range(6):
-            others = [np.roll(photo[:, ::-1], 61 * turn, axis=1) for photo in photos]
-            found.append(([np.where(inside[..., None], other, photos[index]) for other in others], inside))
-    return found
-
-
-def distinct(pictures: list[np.ndarray], mask: np.ndarray, rng: np.random.Generator, most: int) -> list[np.ndarray]:
-    """In random order, those that clearly differ inside the mask from all before."""
-    chosen: list[np.ndarray] = []
-    for index in rng.permutation(len(pictures)):
-        picture = pictures[index].astype(np.float32)
-        if all((np.abs(picture - other).max(axis=2)[mask] > 12).mean() > 0.1 for other in chosen):
-            chosen.append(picture)
-    return chosen[:most]
+    return rendered_stills(SIZE) + real_stills(SIZE)
 
 
 def make(seed: int, stills) -> tuple[Making, np.ndarray, int | None]:

@@ -10,6 +10,7 @@ from helpers.runs import arguments, assert_same_run, train_again
 from gift_peft.group_step import GroupStep
 from gift_peft.training import loop, objectives, train
 from gift_peft.training.arguments import GiftTrainingArguments
+from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
 pytestmark = pytest.mark.filterwarnings("ignore:.*deprecated.*:FutureWarning")
@@ -73,6 +74,43 @@ def test_blocks_are_recomputed_where_not_even_one_image_fits(base_dir, tree, tmp
     assert (config["micro_batch_size"], config["gradient_checkpointing"]) == (2, True)
     said = [line for line in capsys.readouterr().out.splitlines() if "gradient_checkpointing" in line]
     assert tried == [False, True] and len(said) == 1
+
+
+def test_surface_targets_take_fewer_images_at_once_where_memory_asks_for_it(
+    base_dir, tree, tmp_path, monkeypatch, capsys
+):
+    sizes, out = [], tmp_path / "out"
+
+    def choose(step, pixel_values, largest):
+        assert len(pixel_values) == 1
+        sizes.append(largest)
+        return 2
+
+    monkeypatch.setattr(SurfaceStep, "choose_micro_batch_size", choose)
+    real = PredictedDepth.forward
+    forwards = []
+    monkeypatch.setattr(
+        PredictedDepth, "forward", lambda self, pixels: forwards.append(len(pixels)) or real(self, pixels)
+    )
+    options = {"target": "surface", "fills": 0, "per_device_train_batch_size": 3, "checkpoints_total_limit": None}
+    args = arguments(base_dir, tree, out, **options)
+    result = train(args)
+    assert "Micro-batches of 2 images, by memory" in capsys.readouterr().out
+    assert sizes == [3] and set(forwards) == {1, 2}
+    assert yaml.safe_load((out / "config.yaml").read_text())["micro_batch_size"] == 2
+    assert identity_of(out / f"checkpoint-{result.step}")["micro_batch_size"] == 2
+
+    again = GiftTrainingArguments(**{**vars(args), "output_dir": str(tmp_path / "again")})
+    again.resume_from_checkpoint = str(out / f"checkpoint-{result.step - 1}")
+    train(again)
+    assert sizes == [3]  # not chosen anew
+    assert_same_run(tmp_path / "again", out)
+
+    train(arguments(base_dir, tree, tmp_path / "fixed", **options, micro_batch_size=2))
+    assert_same_run(tmp_path / "fixed", out)
+    forwards.clear()
+    train(arguments(base_dir, tree, tmp_path / "whole", **options, micro_batch_size=100))
+    assert max(forwards) == 3  # no more than what an update takes
 
 
 def test_the_base_is_loaded_once(base_dir, tree, tmp_path, monkeypatch):

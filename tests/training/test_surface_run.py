@@ -141,7 +141,8 @@ def test_images_of_any_groups_make_an_update(groups):
 def test_the_adapter_says_what_it_was_trained_to(whole):
     record = json.loads((whole / "adapter/gift.json").read_text())
     assert record["arguments"]["target"] == "surface" and record["arguments"]["lambda_c"] == 1.5
-    assert record["arguments"]["fills"] == FILLS and "micro_batch_size" not in record["arguments"]
+    assert record["arguments"]["fills"] == FILLS and "retain" not in record["arguments"]
+    assert record["arguments"]["micro_batch_size"] == 2  # what "auto" came to
     assert record["num_groups"] == 4 and record["epoch"] in (1, 2)
     card = (whole / "adapter/README.md").read_text()
     assert "target: surface" in card and "distance to the surface target : distillation = 1.5:1" in card
@@ -239,7 +240,6 @@ REFUSED = {
     "surface_model": ({"surface_model": "plane"}, "consensus does not take it"),
     "surface_tau": ({"target": "surface", "surface_tau": 1.0}, "between 0 and 1"),
     "retain": ({"target": "surface", "retain": "0"}, "target: surface does not take it"),
-    "micro_batch_size": ({"target": "surface", "micro_batch_size": 1}, "surface does not take it"),
     "profile": ({"target": "surface", "profile": 2}, "surface does not take it"),
     "target": ({"target": "median"}, "neither consensus nor surface"),
     "warmup_steps": ({"warmup_steps": -1}, "must be finite and not negative"),

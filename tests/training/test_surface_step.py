@@ -9,6 +9,7 @@ from accelerate.state import AcceleratorState, GradientState
 from accelerate.utils import DistributedDataParallelKwargs
 from helpers.group_tools import gift_model, gradients, group, largest_error, toy
 
+from gift_peft.memory import GraphBudget
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
 LAMBDAS = 1.5, 0.8
@@ -111,13 +112,49 @@ def test_memory_that_runs_out_halves_the_micro_batch():
         step.accumulate(*data)
 
 
+@pytest.mark.parametrize(("room", "expected"), [(0, 2), (1, 2), (3, 2), (4, 4), (7, 4), (8, 8), (100, 8)])
+def test_the_micro_batch_is_measured(room, expected, monkeypatch):
+    """Of up to eight: all where their graphs fit beside the measured one, else what a backward leaves, evenly."""
+    monkeypatch.setattr(GraphBudget, "images", lambda self, pixel_values, canvas: room)
+    model, (pixels, *_) = gift_model(), images()
+    step, forwards = SurfaceStep(PredictedDepth(model), micro_batch_size=8), []
+    handle = model.register_forward_hook(lambda module, args, output: forwards.append(output.predicted_depth))
+    assert step.choose_micro_batch_size(pixels[:1], 8) == step.micro_batch_size == expected
+    handle.remove()
+    assert [len(depth) for depth in forwards] == [2] and forwards[0].requires_grad
+    assert all(p.grad is None for p in model.parameters())
+    assert step.choose_micro_batch_size(pixels[:1], 3) == (3 if room >= 3 else 2)
+    assert step.choose_micro_batch_size(pixels[:1], 1) == 1
+
+
+@pytest.mark.parametrize("fits", [0, 1])
+def test_one_image_where_two_do_not_fit_and_not_even_one(fits):
+    model, (pixels, *_) = toy(torch.float64), images()
+    forward = model.forward
+
+    def tight(pixel_values):
+        if len(pixel_values) > fits:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return forward(pixel_values)
+
+    model.forward = tight
+    step = SurfaceStep(PredictedDepth(model), micro_batch_size=4)
+    if fits:
+        assert step.choose_micro_batch_size(pixels[:1], 4) in (1, 2, 4)  # by what this machine has
+        model.forward = forward
+    else:
+        with pytest.raises(torch.OutOfMemoryError, match="not even one image"):
+            step.choose_micro_batch_size(pixels[:1], 4)
+        assert step.micro_batch_size == 4
+
+
 def test_bad_input_is_one_line():
     model, (pixels, mask, target, valid) = toy(), images(3, torch.float32)
     names = ["g/a.png", "g/b.png", "g/c.png"]
     bad, infinite = pixels.clone(), target.clone()
     bad[2], infinite[1] = math.nan, math.inf
     cases = {
-        "the prediction of g/c.png (image 0) has NaN": (bad, mask, target, valid, names),
+        "the prediction of g/c.png (image 2) has NaN": (bad, mask, target, valid, names),
         "the surface target of g/b.png (image 1) has NaN": (pixels, mask, infinite, valid, names),
         "the prediction is 28x28 but mask and target are 14x28": (pixels, mask[:, :14], target[:, :14], None, names),
         "the loss of this update is NaN or infinite": (pixels, mask, torch.full_like(target, 3e38), valid, names),
@@ -163,6 +200,11 @@ def work(folder):
         for update in range(2):  # the second in the buckets that DDP has rearranged
             output = step.accumulate(*mine, weight=1 / count if count > rank else 0.0)
             answers[name, update] = (tuple(output), gradients(model))
+    budget, GraphBudget.images = GraphBudget.images, lambda self, pixel_values, canvas: 8 - 4 * rank
+    step = SurfaceStep(shell, *LAMBDAS, 8, accelerator)
+    answers["chosen"] = step.choose_micro_batch_size(data[0][:1], 8)  # between two updates
+    GraphBudget.images = budget
+    answers["after"] = tuple(step.accumulate(*mine, weight=1 / count if count > rank else 0.0)), gradients(model)
     bad = [part.clone() for part in images(4)]
     bad[0][2] = math.nan  # of process 0 alone
     shell = accelerator.prepare(PredictedDepth(toy(torch.float64)))
@@ -191,5 +233,14 @@ def test_two_processes_give_the_gradient_of_one(answers, name):
         assert all(torch.equal(got[key], answers[0][name, 1][1][key]) for key in got)
 
 
+def test_processes_take_the_least_and_measuring_leaves_no_trace(answers):
+    assert [each["chosen"] for each in answers] == [4, 4]
+    last = list(SHARES)[-1]
+    for each in answers:
+        output, got = each["after"]
+        assert output == pytest.approx(each[last, 1][0], abs=1e-12)
+        assert largest_error(got, each[last, 1][1]) < 1e-9
+
+
 def test_what_one_process_stumbles_over_all_report(answers):
-    assert "the prediction of image 0 has NaN" in answers[0]["bad"] and answers[0]["bad"] == answers[1]["bad"]
+    assert "the prediction of image 1 has NaN" in answers[0]["bad"] and answers[0]["bad"] == answers[1]["bad"]

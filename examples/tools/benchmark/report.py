@@ -31,7 +31,7 @@ def machine() -> dict:
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "load_at_start": os.getloadavg()[0],
-        "command": shlex.join(["python", "examples/tools/benchmark_group_step.py", *sys.argv[1:]]),
+        "command": shlex.join(["python", f"examples/tools/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
         "python": platform.python_version(),
         **{name: version(name) for name in ("gift-peft", "torch", "transformers", "peft", "accelerate")},
     }
@@ -50,14 +50,20 @@ def replace_section(page: Path, title: str, text: str) -> None:
     page.write_text("\n\n".join(part.strip() for part in sections) + "\n", encoding="utf-8")
 
 
-def to_markdown(results: dict) -> str:
-    facts = results["machine"]
-    lines = [
+def measured_with(facts: dict) -> str:
+    """How a table came to be, in a sentence of what `machine` tells."""
+    return (
         f"`OMP_NUM_THREADS={facts['threads']} {facts['command']}` on "
         f"{facts['cores']} cores ({facts['cpu']}), {facts['threads']} threads, load {facts['load_at_start']:.1f} "
         f"when it started. Python {facts['python']}, "
         + ", ".join(f"{n} {facts[n]}" for n in ("torch", "transformers", "peft", "accelerate"))
-        + f", gift-peft {facts['gift-peft']}.",
+        + f", gift-peft {facts['gift-peft']}."
+    )
+
+
+def to_markdown(results: dict) -> str:
+    lines = [
+        measured_with(results["machine"]),
         "",
         "An epoch is GIFT-I's: 353 groups of 2 to 55 images, 3,268 images, 20,339 pairs (the list of sizes is in the",
         "script). **It is extrapolated**: one group per stratum of sizes is timed, and of (a) some of its pairs; the",
@@ -80,14 +86,17 @@ def model_table(name: str, result: dict) -> list[str]:
         "",
         f"Groups of {', '.join(map(str, result['sampled_group_sizes']))} images, {result['repeats']} repeats.",
         "",
-        "| | updates | image forwards | s per epoch | faster than (a) | than (b) | images/s | TFLOP/s | of matmul |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "| | updates | image forwards | s per epoch | faster than (a) | than (b) | than (c) | images/s | TFLOP/s "
+        "| of matmul |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for method, row in result["methods"].items():
         lines.append(
             f"| ({method}) {METHODS[method]} | {row['updates']:,} | {row['image_forwards']:,} | "
             f"{spread(row['seconds_per_epoch'], '.1f')} | {spread(row['faster_than_a'], '.2f')} | "
-            f"{spread(row['faster_than_b'], '.2f')} | {row['images_per_second']:.1f} | "
+            f"{spread(row['faster_than_b'], '.2f')} | "
+            f"{spread(row['faster_than_c'], '.2f') if 'faster_than_c' in row else 'does not fit'} | "
+            f"{row['images_per_second']:.1f} | "
             f"{row['tflops_per_second']:.3g} | {row['share_of_matmul']:.0%} |"
         )
     lines += ["", "| share of time | " + " | ".join([*PHASES, "rest"]) + " |", "|---|" + "---:|" * (len(PHASES) + 1)]
@@ -102,9 +111,10 @@ def model_table(name: str, result: dict) -> list[str]:
     retained = 2 - result["methods"]["d"]["image_forwards"] / 3268
     lines += [
         "",
-        f"* (d) retained {retained:.0%} of the images. A gradient by (d) is that by (b) up to "
-        f"{result['gradients']['d_minus_b_max']:g} (largest difference), by (c) up to "
-        f"{result['gradients']['c_to_b_relative_l2']:.1e} (relative L2 norm).",
+        f"* (d) took micro-batches of {result['micro_batch_size']} images and retained {retained:.0%} of the images. "
+        f"With the micro-batches of (b) its gradient is that of (b) up to {result['gradients']['d_minus_b_max']:g} "
+        f"(largest difference), as it is that of (c) up to {result['gradients']['d_to_c_relative_l2']:.1e} (relative "
+        "L2 norm).",
         f"* The loader delivers {result['loader_images_per_second']:.0f} images/s from its cache, "
         f"{result['loader_to_step']:.1f} times what (d) consumes.",
     ]

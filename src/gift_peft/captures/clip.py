@@ -6,7 +6,7 @@ is chosen by `prepare/clip_frames.py`.
 
 import os
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,7 +63,7 @@ class Clip:
         self.rate = rate if 0 < rate < 1000 else 30.0
         capture.release()
 
-    def frames(self, wanted: Iterable[int] | None = None) -> Iterator[ClipFrame]:
+    def frames(self, wanted: Iterable[int] | None = None) -> Generator[ClipFrame, None, None]:
         """All frames in order, or only those of these numbers; the others are then decoded, but not converted.
 
         The clip ends where no frame can be decoded any more. ValueError naming it: not even one can be.
@@ -100,8 +100,7 @@ class Clip:
     def _open(self) -> "cv2.VideoCapture":
         import cv2
 
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else it writes a line for each damaged byte
-        capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        capture = open_quietly(str(self.path))
         if not capture.isOpened():
             raise ValueError(
                 f"{self.path}: cannot be opened as a video; a recording that was cut off, or a format that OpenCV "
@@ -118,6 +117,14 @@ class Clip:
                 f"{self.path}: frames of {pixels.shape[1]}x{pixels.shape[0]}; a side is at most {MAX_SIDE}"
             )
         return pixels
+
+
+def open_quietly(source: str) -> "cv2.VideoCapture":
+    """What FFmpeg opens, a file or an address; it writes nothing to stderr."""
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else it writes a line for each damaged byte
+    return cv2.VideoCapture(source, cv2.CAP_FFMPEG)
 
 
 def write_frame(path: Path, pixels: np.ndarray) -> None:

@@ -11,6 +11,7 @@ import json
 import logging
 import os
 from pathlib import Path
+from threading import Lock
 
 import datasets
 import numpy as np
@@ -57,6 +58,8 @@ class GroupCache:
         self._groups = RowRules(rules.train, parsed=True).apply(dataset)
         self._stored = dataset.with_format("arrow")
         self._checked: dict[int, Path] = {}  # the entries that were found whole in this run
+        self._written: set[int] = set()
+        self._locks: dict[int, Lock] = {}
 
     def read(self, index: int, image: int | None = None) -> Group:
         """The group of one row, without its `pictures`; or one image of it, with its surface targets alone.
@@ -65,15 +68,9 @@ class GroupCache:
         """
         path = self._checked.get(index) or self._path(index)
         found = None if path is None else self._load(path, check=index not in self._checked)
-        if found is None:
-            pictures = self._groups[index]
-            arrays = resize_pictures(pictures, self.processor, self.size)
-            digests = picture_digests(pictures) | mask_digests(pictures)
-            if path is not None:
-                self._write(path, arrays, digests)
-        else:
+        arrays, digests = self._made(index, path) if found is None else found
+        if found is not None:
             self._checked[index] = path
-            arrays, digests = found
         group_id, names, surface = self._facts(index)
         proxies, targets, part = (None, None), (None, None), slice(None)
         if image is not None:  # the arrays are mapped into memory: only this image's pages are read
@@ -84,6 +81,19 @@ class GroupCache:
         if self._surface is not None:
             targets = self._surface.read(group_id, names, digests, part)
         return to_group(group_id, names[part], surface, arrays, proxies, self.processor, self.size, targets)
+
+    def _made(self, index: int, path: Path | None) -> tuple[dict[str, np.ndarray], dict]:
+        """(arrays, digests of the pictures) of a row without an entry; threads that want the same one wait."""
+        with self._locks.setdefault(index, Lock()):
+            found = self._load(path, check=True) if path is not None and index in self._written else None
+            if found is None:
+                pictures = self._groups[index]
+                arrays = resize_pictures(pictures, self.processor, self.size)
+                found = arrays, picture_digests(pictures) | mask_digests(pictures)
+                if path is not None:
+                    self._write(path, *found)
+                    self._written.add(index)
+            return found
 
     def _facts(self, index: int) -> tuple[str, list[str], str | None]:
         """(group id, image names, surface) of a row, whose pictures stay as they are stored."""

@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 
 import datasets
-import numpy as np
 import pyarrow as pa
 from datasets import ClassLabel, Features, List, Value
 from datasets import Image as ImageFeature
@@ -22,6 +21,7 @@ from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
 from gift_peft.captures.tree import list_groups, raw_example
+from gift_peft.dataset.digests import DigestCache, fingerprint
 from gift_peft.dataset.proxies import (
     EARLIER,
     FORMAT,
@@ -36,7 +36,6 @@ from gift_peft.dataset.proxies import (
 from gift_peft.dataset.row_checks import check_rows
 from gift_peft.dataset.rows import RowRules
 from gift_peft.files import is_hub_id, is_leftover, reason
-from gift_peft.images import image_digest
 from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.models.pixels import pixel_settings
 from gift_peft.rules import SPLITS, SURFACES
@@ -309,16 +308,6 @@ def dataset_fingerprint(dataset: datasets.Dataset) -> str:
 
     The same for raw tree, prepared folder and parquet of the same groups, and for any order of the groups.
     """
-    digests = []
-    groups = RowRules(parsed=True).apply(dataset)
-    for group in tqdm(groups, desc="reading the dataset", unit="group", delay=2):
-        digest = hashlib.sha256(group.group_id.encode())
-        for name, image, mask in zip(group.names, group.images, group.masks, strict=True):
-            digest.update(f"\n{name} {image_digest(image)} ".encode())
-            digest.update(np.packbits(mask).tobytes())
-        for valid in group.valids:
-            digest.update(np.packbits(valid).tobytes())
-        if group.reference is not None:
-            digest.update(image_digest(group.reference).encode())
-        digests.append(digest.hexdigest())
-    return hashlib.sha256("\n".join(sorted(digests)).encode()).hexdigest()[:32]
+    digests = DigestCache(dataset)
+    bar = tqdm(range(len(digests)), "reading the dataset", unit="group", delay=2)
+    return fingerprint(digests.read(index)[0].content for index in bar)

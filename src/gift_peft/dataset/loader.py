@@ -53,6 +53,7 @@ class PreparedGroups:
         pin: bool = False,
     ) -> None:
         self.dataset = dataset
+        self.image_names: list[list[str]] = dataset["image_names"][:]
         self.num_threads = num_threads
         self.pin = pin
         self._cache = GroupCache(dataset, processor, size, cache_dir)
@@ -92,7 +93,8 @@ class PreparedImages:
 
     def __init__(self, groups: PreparedGroups) -> None:
         self.groups = groups
-        counts = map(len, groups.dataset["image_names"])
+        self.num_threads = groups.num_threads
+        counts = map(len, groups.image_names)
         self._places = [(row, image) for row, count in enumerate(counts) for image in range(count)]
 
     def __len__(self) -> int:
@@ -119,7 +121,7 @@ class PreparedImages:
 
     def take(self, items: Iterable[tuple[int, bool]]) -> Iterator[Group]:
         """`read` of these (index, flip), in this order; there may be infinitely many."""
-        return read_ahead(lambda item: self.read(*item), items, self.groups.num_threads)
+        return read_ahead(lambda item: self.read(*item), items, self.num_threads)
 
 
 def read_ahead(read: Callable[[Item], Group], items: Iterable[Item], num_threads: int) -> Iterator[Group]:

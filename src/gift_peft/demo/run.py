@@ -17,7 +17,7 @@ from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.rows import parsed
 from gift_peft.demo.side_by_side import markdown, panels, summary
 from gift_peft.demo.validation_page import validation_page
-from gift_peft.evaluation.evaluate import REFERENCES, evaluate_gift_i
+from gift_peft.evaluation.evaluate import evaluate_references
 from gift_peft.evaluation.results import Report
 from gift_peft.files import read_yaml, strangers, whole_folder, write_whole
 from gift_peft.models.loading import DepthModel
@@ -127,12 +127,10 @@ def _arguments(
 
 def _evaluate(model: DepthModel, groups, out: Path, run: Path, seed: int) -> dict[str, Report]:
     """Against the proxies and against true depth; both are written into the run's folder."""
-    reports = {}
-    for reference in REFERENCES:
-        report = evaluate_gift_i(groups, model, reference=reference)
+    reports = evaluate_references(groups, model)
+    for reference, report in reports.items():
         report.about = {"base": f"{out}/base", "adapter": f"{run}/adapter", "dataset": f"{out}/gift-i", "seed": seed}
         report.save(run / f"evaluation-{reference}")
-        reports[reference] = report
     return reports
 
 

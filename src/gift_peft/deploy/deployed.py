@@ -1,5 +1,6 @@
 """An exported folder where a `DepthModel` is expected: `gift-peft predict --deployed` takes it, and needs no torch."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,10 @@ class DeployedModel:
         self.millimeters_per_unit = settings.get("millimeters_per_unit") or 1.0
         self._scale = adapter_scale
 
+    def inputs(self, images: Sequence[Image.Image]) -> np.ndarray:
+        """Upright RGB pictures to pixel values (B,3,h,w) float32, to the bit as in training."""
+        return np.concatenate([self.predictor.prepare(image) for image in images])
+
     def depth_at(
         self, image: str | Path | Image.Image, focal_length: float | None = None, base: bool = False
     ) -> np.ndarray:
@@ -51,6 +56,17 @@ class DeployedModel:
         """
         name = str(image) if isinstance(image, str | Path) else "the picture"
         picture = read_image(image, name)
-        scale = 0.0 if base else self._scale
-        prediction = self.predictor.predict(self.predictor.prepare(picture), scale)[0]
-        return self.predictor.finish(prediction, (picture.height, picture.width), name, focal_length)
+        return self.depths_of(self.inputs([picture]), [picture.size[::-1]], [name], focal_length, base)[0]
+
+    def depths_of(
+        self,
+        pixel_values: np.ndarray,
+        sizes: Sequence[tuple[int, int]],
+        names: Sequence[str],
+        focal_length: float | None = None,
+        base: bool = False,
+    ) -> list[np.ndarray]:
+        """As `DepthModel.depths_of`: `depth_at` of several pictures at once, of their `inputs` and (height, width)."""
+        predictions = self.predictor.predict(pixel_values, 0.0 if base else self._scale)
+        rows = zip(predictions, sizes, names, strict=True)
+        return [self.predictor.finish(prediction, size, name, focal_length) for prediction, size, name in rows]

@@ -21,7 +21,8 @@ def predict_ahead(
     """In the order of the files, {"own": (H,W) float32, "base": the same of the base} or the error of that picture.
 
     Args:
-        model: a `DepthModel`; or anything with its `depth_at`, which then takes one picture at a time.
+        model: a `DepthModel` or `DeployedModel`; or anything with their `depth_at`, which then takes one picture at a
+            time.
         base_too (`bool`): with the base's depth.
         batch_size (`int`, *optional*): pictures per forward; default 8 on a GPU, else 1. The last bits of a prediction
             may depend on it.
@@ -78,14 +79,21 @@ def _depths(model: Any, opened: list[tuple], base_too: bool, focal_length: Any) 
         return [
             {way: model.depth_at(file, focal_length, base=base) for way, base in ways.items()} for (file,) in opened
         ]
-    import torch
-
     pixels, sizes, names = zip(*opened, strict=True)
-    own = model.depths_of(torch.cat(pixels), sizes, names, focal_length)
+    batch = _joined(pixels)
+    own = model.depths_of(batch, sizes, names, focal_length)
     if not base_too:
         return [{"own": depth} for depth in own]
-    base = model.depths_of(torch.cat(pixels), sizes, names, focal_length, base=True)
+    base = model.depths_of(batch, sizes, names, focal_length, base=True)
     return [{"own": first, "base": second} for first, second in zip(own, base, strict=True)]
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    if isinstance(parts[0], np.ndarray):  # of an exported model, which runs where there is no torch
+        return np.concatenate(parts)
+    import torch
+
+    return torch.cat(parts)
 
 
 def _default_batch(model: Any) -> int:

@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gift_peft.options import number
 
@@ -85,12 +85,18 @@ def make_outputs(args: argparse.Namespace) -> "MetricOutputs | None":
 
 def run_video(args: argparse.Namespace) -> int:
     """`gift-peft predict --video`: the exit code."""
+    from gift_peft.deploy.deployed import DeployedModel
     from gift_peft.deploy.video import predict_video
-    from gift_peft.models.loading import DepthModel
 
-    model = DepthModel.from_pretrained(
-        args.base, args.adapter, args.adapter_scale, args.revision, args.size, args.kind, accept_base=args.accept_base
-    )
+    if args.deployed is not None:
+        model: Any = DeployedModel(args.deployed, args.backend, args.adapter_scale)
+    else:
+        from gift_peft.models.loading import DepthModel
+
+        scale, revision = args.adapter_scale, args.revision
+        model = DepthModel.from_pretrained(
+            args.base, args.adapter, scale, revision, args.size, args.kind, accept_base=args.accept_base
+        )
     result = predict_video(args.video, model, args.out, args.sensor_mask, args.frames, args.batch_size or 1)
     print(f"{result['clip']}: {result['frames']} frames, {result['frames_per_second']:.2f} a second")
     for name, percent in result.get("flicker_percent", {}).items():

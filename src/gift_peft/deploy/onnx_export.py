@@ -121,6 +121,10 @@ def exported_program(network: nn.Module, multiple: int, dial: bool, name: str) -
 def failed_operation(error: BaseException) -> str:
     """The operation that an exporter's error is about, in one line."""
     text = str(error)
+    if "Exception summary" in text:  # torch.onnx tells what to do next; what happened is what it was raised from
+        while error.__cause__ is not None:
+            error = error.__cause__
+        return reason(error)[:300]
     operation = re.search(r"\b(?:aten|torchvision|prims)(?:\.|::)\w+", text)
     source = re.findall(r'File "([^"]+)", line (\d+), in \w+\n\s+(\S.*)', text)
     where = f"{Path(source[-1][0]).name}:{source[-1][1]}: {source[-1][2].strip()}" if source else ""

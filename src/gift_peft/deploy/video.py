@@ -16,9 +16,11 @@ import numpy as np
 from tqdm import tqdm
 
 from gift_peft.colormap import color_range, colorize
+from gift_peft.deploy.deployed import DeployedModel
 from gift_peft.deploy.sensor import UnrelatedDepthError, robust_line
 from gift_peft.deploy.sensor_files import read_mask
 from gift_peft.files import jsonable, write_whole
+from gift_peft.images import SUFFIXES
 
 RATE = 30.0  # frames a second of a camera or clip that does not say it
 MEMORY = 1.0  # seconds in which the colors follow a change of the whole scene
@@ -76,7 +78,8 @@ def predict_video(
 
     Args:
         source: a clip, or the number of a camera ("0").
-        model (`DepthModel`): predicts; without an adapter the clip shows photo and prediction.
+        model (`DepthModel` or `DeployedModel`): predicts; without an adapter (or the dial of an exported one) the clip
+            shows photo and prediction.
         mask (*optional*): picture of the target, for the flicker inside it.
         frames (`int`, *optional*): stop after so many; a camera stops with Ctrl-C as well.
         batch_size (`int`): frames per forward.
@@ -104,7 +107,7 @@ def predict_video(
     if any(path.exists() for path in (clip, facts)) and not (facts.is_file() and b'"clip":' in facts.read_bytes()):
         capture.release()
         raise ValueError(f"{clip} was not written by gift-peft predict and is kept: choose another folder")
-    models = ["base", "adapted"] if model.adapted else ["base"]
+    models = _models(model)
     state = _Clip(partial, rate, models, model.kind or "inverse_depth", str(source))
     begin = time.perf_counter()
     quiet = None if progress else True
@@ -183,6 +186,13 @@ class _Clip:
             self.bar.close()
 
 
+def _models(model: Any) -> list[str]:
+    """What stands beside the photo, by name; of an export without a dial nobody can tell the base any more."""
+    if model.adapted:
+        return ["base", "adapted"]
+    return ["deployed"] if isinstance(model, DeployedModel) else ["base"]
+
+
 def _open(source: str | Path) -> tuple[Any, str]:
     """The open clip or camera, and the stem of what is written."""
     if str(source).isdigit() and not Path(source).exists():
@@ -191,6 +201,8 @@ def _open(source: str | Path) -> tuple[Any, str]:
     else:
         if not Path(source).is_file():
             raise FileNotFoundError(f"{source}: no such clip")
+        if Path(source).suffix.lower() in SUFFIXES:  # OpenCV takes 01.jpg for a clip of 01.jpg, 02.jpg ...
+            raise ValueError(f"{source}: a picture, not a clip; leave --video out")
         capture, name = cv2.VideoCapture(str(source)), Path(source).stem
         trouble = f"{source}: not a clip that can be read"
     if not capture.isOpened():

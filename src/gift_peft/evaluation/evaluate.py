@@ -2,44 +2,29 @@
 
 Every image is predicted by the base and by the adapted model, aligned to its reference and scored per region; GCE
 (Eq. 7) is the mean over groups. The consensus is the base with its target replaced by the group's per-pixel median:
-what Eq. 3 pulls towards. Scores are taken on the CPU in float64, image by image, so that a row does not depend on
-the other groups or their order.
+what Eq. 3 pulls towards. Predictions are made in the precision that the model is in, which for `DepthModel` is
+float32 without TF32, as the proxies are.
 """
 
-import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from tqdm import tqdm
 
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.rows import parsed
 from gift_peft.dataset.tensors import Group
-from gift_peft.evaluation.alignment import align, known, resize_prediction
 from gift_peft.evaluation.booster_scenes import TOM_CLASSES, BoosterScene, GroundTruth, find_booster, read_ground_truth
-from gift_peft.evaluation.fitting import DegenerateFitError
-from gift_peft.evaluation.metrics import depth_metrics, metric_names
-from gift_peft.evaluation.protocols import MILLIMETERS, Protocol, get_protocol
-from gift_peft.evaluation.results import REGIONS, Report, make_report
-from gift_peft.evaluation.safety import Flicker, false_free_space
-from gift_peft.evaluation.samples import (
-    Observation,
-    Predictor,
-    Sample,
-    booster_sample,
-    gift_i_sample,
-    predict_scene,
-)
+from gift_peft.evaluation.protocols import Protocol, get_protocol
+from gift_peft.evaluation.results import Report, make_report
+from gift_peft.evaluation.samples import Predictor, Sample, booster_sample, gift_i_samples, predict_scene
+from gift_peft.evaluation.scoring import Task, score_groups
 from gift_peft.evaluation.stored_predictions import PredictionFolder
-from gift_peft.losses import GeometryConsistencyError, prediction_spread
 from gift_peft.models.loading import DepthModel
-from gift_peft.models.pixels import resize_mask
 from gift_peft.rules import KINDS, parse_group
 
 REFERENCES = {"proxy": "native", "depth": "gift"}  # and the protocol that goes with each
@@ -103,31 +88,60 @@ def evaluate_gift_i(
     if size is None and not isinstance(model, DepthModel):
         size = _proxies_size(dataset)
     depth_model = DepthModel.of(model, teacher=teacher, processor=processor, size=size, kind=kind)
-    rules = replace(get_protocol(protocol or REFERENCES[reference]), resolution=1.0)  # on the reference's own grid
-    if reference == "proxy" and rules.space != "native":
-        raise ValueError(
-            f'protocol {rules.name} aligns to depth in {rules.unit}; proxies are in native units: use "native", or '
-            'reference="depth"'
-        )
-    # Against proxies nothing is ever inverted, so a callable without a recipe need not say what it predicts.
-    kind = depth_model.kind or "depth" if reference == "proxy" else depth_model.known_kind()
-    if reference == "depth" and rules.space == "native" and kind == "inverse_depth":
-        raise ValueError(f'protocol {rules.name} would fit inverse depth straight to depth; use "gift"')
-    predictors = _predictors(depth_model, baseline, batch_size)
+    rules = {reference: get_protocol(protocol or REFERENCES[reference])}
+    options = (baseline, accelerator, prediction_scale, batch_size, progress)
+    return _against(dataset, depth_model, rules, *options)[reference]
+
+
+def evaluate_references(dataset: Any, model: DepthModel) -> dict[str, Report]:
+    """`evaluate_gift_i` against each of `REFERENCES`, with its own protocol; every image is predicted once."""
+    rules = {reference: get_protocol(protocol) for reference, protocol in REFERENCES.items()}
+    return _against(parsed(dataset), model, rules, True, None, None, 2, True)
+
+
+def _against(
+    dataset: Any,
+    model: DepthModel,
+    rules: dict[str, Protocol],
+    baseline: bool,
+    accelerator: Any,
+    prediction_scale: float | None,
+    batch_size: int,
+    progress: bool,
+) -> dict[str, Report]:
+    """A report for each reference that has a protocol; arguments and errors as of `evaluate_gift_i`."""
+    predictors = _predictors(model, baseline, batch_size)
     models = [*predictors, *(["consensus"] if "base" in predictors else [])]
-    scale = prediction_scale or (1.0 if rules.fits_scale else depth_model.millimeters_per_unit)
-    in_mm = reference == "depth"
-    task = Task(models, rules, kind, scale, NO_DEPTH if in_mm else NO_PROXY, in_mm)
+    tasks = {}
+    for reference, protocol in rules.items():
+        protocol = replace(protocol, resolution=1.0)  # on the reference's own grid
+        if reference == "proxy" and protocol.space != "native":
+            raise ValueError(
+                f"protocol {protocol.name} aligns to depth in {protocol.unit}; proxies are in native units: use "
+                '"native", or reference="depth"'
+            )
+        # Against proxies nothing is ever inverted, so a callable without a recipe need not say what it predicts.
+        kind = model.kind or "depth" if reference == "proxy" else model.known_kind()
+        if reference == "depth" and protocol.space == "native" and kind == "inverse_depth":
+            raise ValueError(f'protocol {protocol.name} would fit inverse depth straight to depth; use "gift"')
+        scale = prediction_scale or (1.0 if protocol.fits_scale else model.millimeters_per_unit)
+        in_mm = reference == "depth"
+        tasks[reference] = Task(models, protocol, kind, scale, NO_DEPTH if in_mm else NO_PROXY, in_mm)
 
-    def read(index: int) -> Sample:
-        return gift_i_sample(dataset[index], depth_model, predictors, reference, "consensus" in models)
+    def read(index: int) -> list[Sample]:
+        return gift_i_samples(dataset[index], model, predictors, list(tasks), "consensus" in models)
 
-    groups, rows = _evaluate(len(dataset), read, task, accelerator, progress, "group")
-    if not rows:
-        raise ValueError("the dataset has no groups to evaluate")
-    if reference == "depth" and all(row["skipped"] == NO_DEPTH for row in rows):
-        raise ValueError('no group of the dataset has true depth; evaluate against the proxies (reference="proxy")')
-    return make_report("gift-i", groups, rows, models, rules, reference)
+    scored = score_groups(len(dataset), read, list(tasks.values()), accelerator, progress, "group")
+    reports = {}
+    for (reference, task), (groups, rows) in zip(tasks.items(), scored, strict=True):
+        if not rows:
+            raise ValueError("the dataset has no groups to evaluate")
+        if reference == "depth" and all(row["skipped"] == NO_DEPTH for row in rows):
+            raise ValueError(
+                'no group of the dataset has true depth; evaluate against the proxies (reference="proxy")'
+            )
+        reports[reference] = make_report("gift-i", groups, rows, models, task.protocol, reference)
+    return reports
 
 
 def _proxies_size(dataset: Any) -> tuple[int, int] | None:
@@ -212,12 +226,12 @@ def evaluate_booster(
 
     task = Task(models, rules, kind, scale, NO_DEPTH, in_mm=True)
 
-    def read(index: int) -> Sample:
+    def read(index: int) -> list[Sample]:
         scene = booster.scenes[index]
         truth = read_ground_truth(scene, resize, occlusion, tom_classes)
-        return booster_sample(scene, truth, predict(scene, truth))
+        return [booster_sample(scene, truth, predict(scene, truth))]
 
-    groups, rows = _evaluate(len(booster.scenes), read, task, accelerator, progress, "scene")
+    ((groups, rows),) = score_groups(len(booster.scenes), read, [task], accelerator, progress, "scene")
     report = make_report("booster", groups, rows, models, rules, "depth")
     report.about = {
         "root": str(root),
@@ -247,151 +261,3 @@ def _predictors(model: DepthModel, baseline: bool, batch_size: int) -> dict[str,
     if not model.adapted:
         return {"base": own}
     return {"base": base, "adapted": own} if baseline else {"adapted": own}
-
-
-# ---- the one loop ----
-
-
-@dataclass
-class Task:
-    """The choices of one evaluation, the same for every group.
-
-    Args:
-        models (`list[str]`): those of `base`, `adapted`, `consensus` that are compared.
-        protocol, kind: as in `align`.
-        prediction_scale (`float`): what predictions are multiplied by first.
-        missing (`str`): why a row without a reference is skipped.
-        in_mm (`bool`): the reference is depth, so that safety can be measured.
-    """
-
-    models: list[str]
-    protocol: Protocol
-    kind: str
-    prediction_scale: float
-    missing: str
-    in_mm: bool
-
-
-def _evaluate(
-    count: int, read: Callable[[int], Sample], task: Task, accelerator: Any, progress: bool, unit: str
-) -> tuple[list[dict], list[dict]]:
-    """(GCE per group, rows) of all groups in their order, which the processes share."""
-    rank, world = (accelerator.process_index, accelerator.num_processes) if accelerator else (0, 1)
-    quiet = None if progress and rank == 0 else True
-    mine = tqdm(range(rank, count, world), desc="evaluate", unit=unit, disable=quiet)
-    results = [(index, *_score_group(read(index), task)) for index in mine]
-    if world > 1:
-        from accelerate.utils import gather_object
-
-        results = gather_object(results)
-    results.sort(key=lambda result: result[0])
-    return [group for _, group, _ in results], [row for _, _, own in results for row in own]
-
-
-def _score_group(sample: Sample, task: Task) -> tuple[dict, list[dict]]:
-    """The group's GCE and its rows."""
-    rows, masks, valids = [], [], []
-    maps = {name: [] for name in task.models if name != "consensus"}
-    flicker = {name: Flicker() for name in maps}
-    for observation in sample.observations:
-        score = Scorer(observation, task)
-        row = {"group_id": sample.group_id, "image": observation.name, **sample.told, "skipped": None}
-        row |= {"target_pixels": score.target_pixels, "pixels": score.pixels}
-        for name in task.models:
-            prediction = observation.predictions[name]
-            small = _at_most(prediction, sample.limit)
-            if name in maps:
-                maps[name].append(small)
-            row[name] = _native_statistics(small, observation)
-            scores, aligned, skipped = score(prediction)
-            row[name] |= scores
-            if task.in_mm and name in maps:
-                row[name]["false_free_space"] = math.nan
-                if aligned is not None and observation.reference is not None:
-                    row[name]["false_free_space"] = false_free_space(aligned, observation.reference, score.target)
-                    flicker[name].update(aligned, score.target)
-            if skipped and not row["skipped"]:
-                row["skipped"] = skipped.format(model=name)
-        rows.append(row)
-        masks.append(observation.mask)
-        valids.append(observation.valid)
-    group = {"group_id": sample.group_id, **sample.told, "num_images": len(rows)}
-    for name, depths in maps.items():
-        error = GeometryConsistencyError()
-        group[f"gce_{name}"] = error.update(*_on_one_grid(depths, masks, valids))
-        group[f"gce_{name}_normalized"] = error.compute_normalized()
-        if task.in_mm:
-            group[f"flicker_{name}"] = flicker[name].compute()
-        group["counted"] = error.num_groups == 1  # False: no two target masks overlap
-    return group, rows
-
-
-class Scorer:
-    """Alignment and metrics per region of the predictions of one observation."""
-
-    def __init__(self, observation: Observation, task: Task) -> None:
-        self.task, self.reference = task, observation.reference
-        mask = observation.mask
-        valid = np.ones(mask.shape, bool) if observation.valid is None else observation.valid
-        there = np.zeros(mask.shape, bool) if self.reference is None else valid & known(self.reference)
-        self.unit = MILLIMETERS[task.protocol.unit]
-        if self.reference is not None and self.unit != 1:
-            self.reference = self.reference / self.unit
-        self.regions = {"all": there, "tom": there & mask, "other": there & ~mask}
-        self.pixels = {name: int(np.count_nonzero(self.regions[name])) for name in REGIONS}
-        self.target = mask & valid
-        self.target_pixels = int(np.count_nonzero(self.target))
-
-    def __call__(self, prediction: Any) -> tuple[dict, np.ndarray | None, str | None]:
-        """Scores and aligned (H,W), in mm or native units, of a (h,w) prediction; NaN and why without a reference."""
-        task = self.task
-        nothing = {"scale": float("nan"), "shift": float("nan"), "num_clipped": 0, "num_nonpositive": 0}
-        thresholds = task.protocol.thresholds
-        nothing |= {region: dict.fromkeys(metric_names(thresholds), float("nan")) for region in REGIONS}
-        if self.reference is None or self.pixels["all"] < 2:
-            return nothing, None, task.missing
-        prediction = resize_prediction(prediction, self.reference.shape)
-        if (scale := task.prediction_scale / self.unit) != 1:
-            prediction = prediction * scale
-        try:
-            alignment = align(prediction, self.reference, self.regions["all"], task.protocol, task.kind)
-        except DegenerateFitError:
-            return nothing, None, "with a constant {model} prediction"
-        scores = {name: getattr(alignment, name) for name in ("scale", "shift", "num_clipped", "num_nonpositive")}
-        for name in REGIONS:
-            scores[name] = depth_metrics(alignment.aligned, self.reference, self.regions[name], thresholds)
-        return scores, alignment.aligned * self.unit, None
-
-
-def _at_most(prediction: Any, limit: tuple[int, int] | None) -> torch.Tensor:
-    """A prediction as (h,w) float32 of no more pixels than `limit`."""
-    if limit and prediction.shape[0] * prediction.shape[1] > limit[0] * limit[1]:
-        prediction = resize_prediction(prediction, limit)
-    return torch.as_tensor(prediction, dtype=torch.float32)
-
-
-def _native_statistics(prediction: torch.Tensor, observation: Observation) -> dict:
-    """Mean over the target and spread of a (h,w) prediction, in its units, which tell whether outputs collapse."""
-    _, target, valid = _on_one_grid([prediction], [observation.mask], [observation.valid])
-    inside = prediction[(target if valid is None else target & valid)[0]]
-    mean = float(inside.double().mean()) if inside.numel() else float("nan")
-    return {"target_mean": mean, "spread": prediction_spread(prediction, None if valid is None else valid[0])}
-
-
-def _on_one_grid(
-    depths: list[torch.Tensor], masks: list[np.ndarray], valids: list[np.ndarray | None]
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-    """Predictions, target and valid masks of a group (N,h,w), at the size of the first prediction."""
-    height, width = depths[0].shape
-    shape = height, width
-    depth = torch.stack(
-        [d if d.shape == shape else torch.from_numpy(resize_prediction(d, shape)).float() for d in depths]
-    )
-    mask = torch.from_numpy(np.stack([resize_mask(mask, shape) for mask in masks]))
-    if valids[0] is None:
-        return depth, mask, None
-    return (
-        depth,
-        mask,
-        torch.from_numpy(np.stack([resize_mask(valid, shape) for valid in valids if valid is not None])),
-    )

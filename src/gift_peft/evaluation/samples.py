@@ -5,7 +5,7 @@ pictures come one at a time, so that a scene of 12 megapixels takes the memory o
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -64,24 +64,25 @@ class Sample:
 # ---- GIFT-I ----
 
 
-def gift_i_sample(
-    row: Any, model: DepthModel, predictors: Mapping[str, Predictor], reference: str, consensus_too: bool = False
-) -> Sample:
-    """A group of GIFT-I, all of it predicted.
+def gift_i_samples(
+    row: Any,
+    model: DepthModel,
+    predictors: Mapping[str, Predictor],
+    references: Sequence[str],
+    consensus_too: bool = False,
+) -> list[Sample]:
+    """A group of GIFT-I beside each reference, all of it predicted once.
 
     Args:
         row: of `load_gift_i`, or a ready `Group`.
         model: what rows are fed to; its base predicts a treated reference whose proxy is not stored.
         predictors: {name: pixel values (N,3,h,w) to (N,h,w)}.
-        reference (`str`): `proxy` or `depth`.
+        references: of `proxy` and `depth`.
         consensus_too (`bool`): with the `consensus` of `base` among the predictions.
 
     Raises ValueError naming group and image for predictions that are not finite or not of the images' size.
     """
     group = row if isinstance(row, Group) else collate_group(row, model.processor, model.size)
-    if group.target is None and model.masks_itself and reference == "proxy":
-        known = model.predict_proxies(group.pixel_values) != UNKNOWN
-        group = replace(group, valid=known if group.valid is None else group.valid & known)
     maps = _predict(predictors, group.pixel_values, f"group {group.group_id}", group.names)
     for name, prediction in maps.items():
         if prediction.shape != group.mask.shape:
@@ -90,8 +91,18 @@ def gift_i_sample(
                 f"group {group.group_id}: the {name} model predicts {made} for images of {wanted}; "
                 "give a size whose sides are multiples of its patch size"
             )
+    return [_beside(group, model, maps, reference, consensus_too) for reference in references]
+
+
+def _beside(
+    group: Group, model: DepthModel, maps: dict[str, torch.Tensor], reference: str, consensus_too: bool
+) -> Sample:
+    """One reference of `gift_i_samples`."""
+    if group.target is None and model.masks_itself and reference == "proxy":
+        there = model.predict_proxies(group.pixel_values) != UNKNOWN
+        group = replace(group, valid=there if group.valid is None else group.valid & there)
     if consensus_too:
-        maps["consensus"] = consensus(maps["base"], group.mask, group.valid)
+        maps = maps | {"consensus": consensus(maps["base"], group.mask, group.valid)}
     known = _against_depth(group) if reference == "depth" else _against_proxy(group, model)
     observations = [
         Observation(name, {model: depth[index] for model, depth in maps.items()}, *known[index])

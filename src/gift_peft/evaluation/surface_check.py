@@ -13,9 +13,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gift_peft.evaluation.evaluate import REFERENCES, Scorer, Task
+from gift_peft.evaluation.evaluate import REFERENCES
 from gift_peft.evaluation.protocols import get_protocol
 from gift_peft.evaluation.samples import Observation
+from gift_peft.evaluation.scoring import Scorer, Task
 from gift_peft.evaluation.statistics import GroupBootstrap
 from gift_peft.evaluation.tables import counted
 from gift_peft.losses import prediction_spread

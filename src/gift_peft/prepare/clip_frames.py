@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from gift_peft.captures.clip import Clip, ClipFrame, TimeInClip
+from gift_peft.prepare.camera_motion import Anchor
 from gift_peft.prepare.registration import warp
 from gift_peft.prepare.still_moments import QUIET, Look, Moment, Stillness
 from gift_peft.prepare.stillness import (
     OTHER_CONTENT,
     STRUCTURE_CHANGED,
-    Anchor,
     cells_inside,
     change_above,
     difference,

@@ -18,7 +18,6 @@ from gift_peft.dataset.writer import write_group
 from gift_peft.prepare.entries import FrameEntry, GroupEntry, GroupQuality, ReferenceQuality, Remark
 from gift_peft.prepare.frame_bar import note_frame
 from gift_peft.prepare.job import Job, Outcome, capture_digest, group_choices, printable, proposal_choices
-from gift_peft.prepare.matching import Frame
 from gift_peft.prepare.photo import Photo, Rejection
 from gift_peft.prepare.quality import SmallFrame, check_frames, check_group_change, pairwise_changes
 from gift_peft.prepare.registration import register, warp
@@ -110,20 +109,23 @@ def decode(capture: Capture, job: Job, entry: GroupEntry) -> tuple[list[Photo], 
     return photos, Photo(entry.frames[-1], capture.reference, np.asarray(decoded.reference), None), decoded
 
 
-def register_photos(photos: list[Photo], reference: Photo | None, static: bool, job: Job) -> None:
-    """Every other observation, and the treated reference, to the last observation."""
+def register_photos(photos: list[Photo], reference: Photo | None, static: bool, job: Job, again: bool = False) -> None:
+    """Every other observation, and the treated reference, to the last observation.
+
+    `again`: this will be done once more, with other masks, for which the photos' features need not be found again.
+    """
     settings = job.settings.registration
     *others, last = photos
     last.matrix = np.eye(3)
-    target = Frame(last.pixels, last.mask, settings)
+    target = last.frame(last.mask, settings, again)
     for photo in others:
-        photo.decide(register(Frame(photo.pixels, photo.mask, settings), target, static))
+        photo.decide(register(photo.frame(photo.mask, settings, again), target, static))
         note_frame(job.notes)
     if reference is None:
         return
     # Nobody draws a mask for it, and the camera may have moved a little: the target's, and some more.
     around = None if last.mask is None else _around(last.mask)
-    reference.decide(register(Frame(reference.pixels, around, settings), target, static, treated=True))
+    reference.decide(register(reference.frame(around, settings, again), target, static, treated=True))
     if reference.warped:
         text = "the camera moved before the treated reference was taken; it is warped"
         reference.entry.warnings.append(Remark("reference_moved", text))
@@ -145,7 +147,7 @@ def carry_mask(photos: list[Photo], mask: np.ndarray, drawn_on: int | None, stat
     lacking = [photo for photo in photos if photo.mask is None]
     for photo in lacking:
         photo.mask = mask if photo is source else _around(mask)
-    register_photos(photos, None, static, job)
+    register_photos(photos, None, static, job, again=True)
     if source.dropped:
         text = "; ".join(item.text for item in source.entry.reasons)
         raise Rejection("mask_not_carried", f"{source.entry.name} alone has a mask, and cannot be registered: {text}")
@@ -195,7 +197,7 @@ def _propose(photos: list[Photo], reference: Photo | None, static: bool, job: Jo
 
     for photo in photos:
         photo.mask = None
-    register_photos(photos, reference, static, job)
+    register_photos(photos, reference, static, job, again=True)
     usable = [photo for photo in photos if not photo.dropped]
     compared = [photo.registered(photo.pixels) for photo in usable]
     if len(compared) < 2 and reference is not None and not reference.dropped:

@@ -16,12 +16,45 @@ from gift_peft.prepare.settings import RegistrationSettings
 MAX_FEATURES = 6000
 
 
+class Picture:
+    """What of a frame does not depend on where its target is."""
+
+    def __init__(self, gray: np.ndarray, settings: RegistrationSettings):
+        self.gray, self.settings = gray, settings
+
+    @cached_property
+    def features(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points (K, 2), descriptors (K, 128) uint8, contrasts (K,), at the lowest threshold.
+
+        A keypoint's contrast is three times its response; thresholding that gives exactly what SIFT itself gives at a
+        higher threshold, so one detection serves every threshold. Its descriptors are whole numbers up to 255.
+        """
+        low = min(self.settings.min_contrast_threshold, self.settings.contrast_threshold)
+        sift = cv2.SIFT_create(contrastThreshold=low, edgeThreshold=self.settings.edge_threshold)
+        keypoints, descriptors = sift.detectAndCompute(self.gray, None)
+        if not keypoints:
+            return np.empty((0, 2)), np.empty((0, 128), np.uint8), np.empty(0)
+        points = np.array([keypoint.pt for keypoint in keypoints], np.float64)
+        contrasts = np.array([3 * keypoint.response for keypoint in keypoints])
+        return points, descriptors.astype(np.uint8), contrasts
+
+
 class Frame:
     """One picture as registration sees it; what is costly is computed once, since a target frame serves many."""
 
-    def __init__(self, image: np.ndarray, target: np.ndarray | None, settings: RegistrationSettings):
-        """`image` (H, W, 3) RGB uint8, `target` (H, W) bool or None where there is none."""
-        self.gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    def __init__(
+        self,
+        image: np.ndarray,
+        target: np.ndarray | None,
+        settings: RegistrationSettings,
+        seen: "Frame | None" = None,
+    ):
+        """`image` (H, W, 3) RGB uint8, `target` (H, W) bool or None where there is none.
+
+        `seen` is a frame of the same picture and settings, with whatever target: its features are this one's.
+        """
+        self._picture = Picture(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), settings) if seen is None else seen._picture
+        self.gray = self._picture.gray
         self.target = np.zeros(self.gray.shape, bool) if target is None else target
         self.settings = settings
 
@@ -48,24 +81,9 @@ class Frame:
         left, right, top, bottom = columns[0], columns[-1], rows[0], rows[-1]
         return np.array([[left, top], [right, top], [right, bottom], [left, bottom]], np.float64)
 
-    @cached_property
-    def _features(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points (K, 2), descriptors (K, 128), contrasts (K,), at the lowest threshold.
-
-        A keypoint's contrast is three times its response; thresholding that gives exactly what SIFT itself gives at a
-        higher threshold, so one detection serves every threshold.
-        """
-        low = min(self.settings.min_contrast_threshold, self.settings.contrast_threshold)
-        sift = cv2.SIFT_create(contrastThreshold=low, edgeThreshold=self.settings.edge_threshold)
-        keypoints, descriptors = sift.detectAndCompute(self.gray, None)
-        if not keypoints:
-            return np.empty((0, 2)), np.empty((0, 128), np.float32), np.empty(0)
-        points = np.array([keypoint.pt for keypoint in keypoints], np.float64)
-        return points, descriptors, np.array([3 * keypoint.response for keypoint in keypoints])
-
     def features(self, contrast: float, outside_only: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """(K, 2) points and (K, 128) descriptors of at least this contrast; the strongest where there are too many."""
-        points, descriptors, contrasts = self._features
+        """(K, 2) points, (K, 128) float32 descriptors of at least this contrast; the strongest where they are many."""
+        points, descriptors, contrasts = self._picture.features
         chosen = contrasts >= contrast
         if outside_only:
             column, row = np.clip(np.round(points).astype(int), 0, np.array(self.size) - 1).T
@@ -73,7 +91,7 @@ class Frame:
         chosen = np.flatnonzero(chosen)
         if len(chosen) > MAX_FEATURES:
             chosen = np.sort(chosen[np.argsort(-contrasts[chosen], kind="stable")[:MAX_FEATURES]])
-        return points[chosen], descriptors[chosen]
+        return points[chosen], descriptors[chosen].astype(np.float32)
 
 
 @dataclass

@@ -2,7 +2,7 @@
 in the report.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -11,8 +11,10 @@ import numpy as np
 from PIL import Image
 
 from gift_peft.prepare.entries import FrameEntry, Remark
+from gift_peft.prepare.matching import Frame
 from gift_peft.prepare.quality import SmallFrame
 from gift_peft.prepare.registration import Registration, valid_area, warp
+from gift_peft.prepare.settings import RegistrationSettings
 
 
 class Rejection(Exception):
@@ -40,6 +42,7 @@ class Photo:
     pixels: np.ndarray
     mask: np.ndarray | None
     matrix: np.ndarray | None = None
+    _seen: Frame | None = field(default=None, init=False, repr=False)
 
     @property
     def dropped(self) -> bool:
@@ -62,6 +65,12 @@ class Photo:
     def picture(self) -> Path | Image.Image:
         """What is written: the file as it is, or the warped pixels."""
         return Image.fromarray(self.registered(self.pixels)) if self.warped else self.source
+
+    def frame(self, target: np.ndarray | None, settings: RegistrationSettings, again: bool) -> Frame:
+        """As registration sees it, with a `target` (H, W) bool; `again`: it will be registered once more."""
+        frame = Frame(self.pixels, target, settings, self._seen)
+        self._seen = frame if again else None
+        return frame
 
     def decide(self, result: Registration) -> None:
         entry, self.matrix = self.entry, result.matrix

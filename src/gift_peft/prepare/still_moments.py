@@ -17,6 +17,7 @@ STEP = 0.03  # seconds; of a faster stream only some frames are looked at
 QUIET = 0.4  # seconds that a still moment lasts at least
 MOVED_CELLS = 0.0008  # share of the cells, and one, that may differ in a still frame: noise has its outliers
 KEY_FRAME = 5.0  # times the median, which no part of the picture that changes can raise: still noise
+TAIL, MAX_TAIL = 1.6, 3.5  # times what all but as many cells stay below in quiet frames; and grey levels at most
 DRIFT = 2.0  # grey levels within one moment, from its first frame to the others; a slow fade exceeds it
 
 
@@ -54,7 +55,7 @@ class Stillness:
         self._recent: deque[Look] = deque()
         self._waiting: deque[tuple[Look, np.ndarray]] = deque()
         self._first: np.ndarray | None = None
-        self._noises = _LowQuantile()
+        self._noises, self._tails = _LowQuantile(), _LowQuantile()
 
     def see(self, index: int, seconds: float, pixels: np.ndarray) -> Moment | None:
         """The moment that this frame, (H, W, 3) uint8, has ended, if it lasted long enough."""
@@ -68,6 +69,7 @@ class Stillness:
         changes = difference(look.cells, before.cells)
         self._noises.add(noise_of(changes))
         self.noise = self._noises.value
+        self._tails.add(float(np.partition(changes.ravel(), -self._may_differ(changes))[-self._may_differ(changes)]))
         self.still = self._shows_the_same(changes)
         ended = None
         if self.still and self.moment is not None and self._drifts(look.cells):
@@ -84,8 +86,13 @@ class Stillness:
         return ended
 
     def finish(self) -> Moment | None:
-        """The moment in which the stream ends."""
+        """The moment in which the stream ends, or is cut: what follows belongs to another one."""
         return self._finish()
+
+    @property
+    def cells(self) -> np.ndarray:
+        """Of the frame that was looked at last."""
+        return self._recent[-1].cells
 
     @property
     def threshold(self) -> float:
@@ -105,7 +112,13 @@ class Stillness:
     def _shows_the_same(self, changes: np.ndarray, least: float = 0.0) -> bool:
         """Whether differences (h, w) are noise. At a codec's key frames all cells differ a little more."""
         pumping = min(KEY_FRAME * float(np.median(changes)), MAX_CHANGE)
-        return bool((changes > max(self.threshold, pumping, least)).sum() <= 1 + MOVED_CELLS * changes.size)
+        tail = min(TAIL * self._tails.value, MAX_TAIL)
+        return bool((changes > max(self.threshold, pumping, tail, least)).sum() < self._may_differ(changes))
+
+    @staticmethod
+    def _may_differ(changes: np.ndarray) -> int:
+        """One more than the cells that may differ in a still frame."""
+        return min(2 + int(MOVED_CELLS * changes.size), changes.size)
 
     def _count(self, look: Look, pixels: np.ndarray) -> None:
         moment = self.moment

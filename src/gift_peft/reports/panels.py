@@ -9,7 +9,7 @@ from gift_peft.evaluation.alignment import resize_prediction
 from gift_peft.evaluation.booster_scenes import find_booster, read_ground_truth
 from gift_peft.evaluation.evaluate import REFERENCES
 from gift_peft.evaluation.protocols import get_protocol
-from gift_peft.evaluation.samples import Sample, booster_sample, gift_i_sample, predict_scene
+from gift_peft.evaluation.samples import Sample, booster_sample, gift_i_samples, predict_scene
 from gift_peft.images import read_image
 from gift_peft.models.loading import DepthModel
 from gift_peft.reports.figures import Panel
@@ -37,7 +37,7 @@ def group_panels(
     group = parse_group(row)
     pictures = dict(zip(group.names, group.images, strict=True))
     _check(f"group {group.group_id}", labels, pictures)
-    sample = gift_i_sample(group, model, {"base": model.predict_base, "adapted": model.predict}, reference)
+    (sample,) = gift_i_samples(group, model, {"base": model.predict_base, "adapted": model.predict}, [reference])
     return _panels(sample, labels, pictures, model, protocol or REFERENCES[reference])
 
 

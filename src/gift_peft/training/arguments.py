@@ -53,7 +53,7 @@ LENGTH = {"num_train_epochs", "max_steps"}
 
 # What one objective takes and the other refuses.
 OWN = {
-    "consensus": ("micro_batch_size", "retain", "profile"),
+    "consensus": ("retain", "profile"),
     "surface": (
         "per_device_train_batch_size",
         "gradient_accumulation_steps",
@@ -160,8 +160,10 @@ class GiftTrainingArguments:
         "images per forward: a number, or auto, what memory allows, chosen when the run starts (the paper: 2)", "auto"
     )
     retain: str = _arg("images whose graphs are kept instead of replayed: 0 (the paper), a number, or auto", "auto")
-    per_device_train_batch_size: int = _arg("surface: images per forward, of any groups", 4)
-    gradient_accumulation_steps: int = _arg("surface: forwards per update and process", 1)
+    per_device_train_batch_size: int = _arg(
+        "surface: images of any groups, in one forward unless micro_batch_size is smaller", 4
+    )
+    gradient_accumulation_steps: int = _arg("surface: such batches per update and process", 1)
     flip: bool = _arg("surface: show every second image as in a mirror, with its own target", False)
     fills: int = _arg("surface: copies of each photo with its target painted, which the targets are made from", 6)
     surface_model: Literal["auto", "plane", "quantile"] = _arg("surface: what a surface is taken for", "auto")

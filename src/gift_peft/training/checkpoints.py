@@ -17,16 +17,17 @@ from pathlib import Path
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import broadcast_object_list
 from datasets import Dataset
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from tqdm import tqdm
 
 from gift_peft.adapters.folder import ADAPTER_FILES, ADAPTER_WEIGHTS
-from gift_peft.dataset.gift_i import dataset_fingerprint
+from gift_peft.dataset.digests import DigestCache, default_digests_dir, fingerprint
 from gift_peft.files import jsonable, reason, remove_folder, strangers, whole_folder, write_whole
 from gift_peft.models.identity import FILES, earlier_revision, teacher_revision
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
+from gift_peft.training.shares import failing_together, in_order, own_share
 
 BEST = "best"
 CHECKSUMS = "checksums.json"
@@ -180,20 +181,27 @@ def run_identity(
     """What must be the same for a resumed run, under the names of the arguments. `splits`: train, then validation."""
     fixed_length = args.lr_scheduler_type == "linear" or args.eval_delay
     free = FREE_TO_CHANGE - (LENGTH if fixed_length else set())
-    fingerprint = [None]
-    if accelerator.is_main_process:
-        fingerprint = ["-".join(map(dataset_fingerprint, splits))]
     images = args.per_device_train_batch_size * args.gradient_accumulation_steps * accelerator.num_processes
     return {
         **{name: value for name, value in args.values().items() if name not in free},
         **({"images_per_update": images} if args.target == "surface" else {}),
         "model_name_or_path": teacher_revision(args.model_name_or_path, args.model_revision),
-        "dataset_name": broadcast_object_list(fingerprint)[0],
+        "dataset_name": "-".join(_shared_fingerprint(split, accelerator) for split in splits),
         # The fingerprint does not depend on it, the order of the updates does.
         "group_order": hashlib.sha256("\n".join(splits[0]["group_id"]).encode()).hexdigest()[:32],
         "size": "x".join(map(str, size)),
         "mixed_precision": accelerator.mixed_precision,
     }
+
+
+def _shared_fingerprint(split: Dataset, accelerator: Accelerator) -> str:
+    """`dataset_fingerprint`; each process reads its share of the groups, the one it has made the proxies of."""
+    groups, found = DigestCache(split, default_digests_dir()), []
+    bar = {"desc": "reading the dataset", "unit": "group", "delay": 2, "disable": not accelerator.is_main_process}
+    with failing_together(accelerator):
+        for index in tqdm(own_share(len(groups), accelerator), **bar):
+            found.append((index, groups.read(index)[0].content))
+    return fingerprint(in_order(found, accelerator))
 
 
 def _check_identity(before: dict, now: dict) -> None:

@@ -169,7 +169,9 @@ def _peak_memory(device: torch.device) -> int:
 
 def _step(args: GiftTrainingArguments, network: Any, accelerator: Accelerator) -> GroupStep | SurfaceStep:
     if args.target == "surface":
-        return SurfaceStep(PredictedDepth(network), args.lambda_c, args.lambda_d, args.per_device_train_batch_size)
+        largest = args.per_device_train_batch_size
+        cut = largest if args.micro_batch_size == "auto" else min(largest, int(args.micro_batch_size))
+        return SurfaceStep(PredictedDepth(network), args.lambda_c, args.lambda_d, cut)
     return GroupStep(network, args.lambda_c, args.lambda_d, args.micro_batch_size, args.retain, accelerator)
 
 

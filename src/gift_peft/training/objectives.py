@@ -5,14 +5,13 @@ update takes, `accumulate` of that, which puts a gradient into `.grad`, and `fir
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from itertools import repeat
 from typing import Any, NamedTuple
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import gather_object
 from tqdm import tqdm
 
 from gift_peft.dataset.loader import PreparedGroups, PreparedImages, epoch_flips, epoch_order, read_ahead
@@ -23,6 +22,7 @@ from gift_peft.losses import gift_terms, masked_l1
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.mask_checks import check_surroundings, warn_of_masks
 from gift_peft.training.schedule import updates_after
+from gift_peft.training.shares import failing_together, in_order, own_share
 from gift_peft.training.speed import checkpoint_blocks
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
@@ -73,22 +73,11 @@ class Consensus:
         """
         if self.args.micro_batch_size != "auto":
             return {}
-        settled: dict[str, Any] = {"micro_batch_size": before.get("micro_batch_size")}
-        if not before:
-            group = self._read(0).inputs
-            largest = max(map(len, self.groups.dataset["image_names"]))
-            try:
-                settled["micro_batch_size"] = self.step.choose_micro_batch_size(group, largest)
-            except torch.OutOfMemoryError:
-                if self.args.gradient_checkpointing:
-                    raise
-                self.accelerator.print(
-                    "The graph of one image does not fit into memory: its blocks are recomputed in the backward "
-                    "(gradient_checkpointing)"
-                )
-                checkpoint_blocks(self.step.model)
-                settled["gradient_checkpointing"] = True
-                settled["micro_batch_size"] = self.step.choose_micro_batch_size(group, largest)
+
+        def choose() -> int:
+            return self.step.choose_micro_batch_size(self._read(0).inputs, max(map(len, self.groups.image_names)))
+
+        settled = settle_micro_batch(choose, before, self.step.model, self.args, self.accelerator)
         self.step.micro_batch_size = settled["micro_batch_size"]
         return settled
 
@@ -167,6 +156,7 @@ class Surface:
         accelerator: Accelerator,
     ) -> None:
         self.args, self.groups, self.images, self.accelerator = args, groups, PreparedImages(groups), accelerator
+        self.network = model
         prepared, self.optimizer = accelerator.prepare(PredictedDepth(model), optimizer)
         options = (args.lambda_c, args.lambda_d, args.per_device_train_batch_size, accelerator)
         self.step = SurfaceStep(prepared, *options)
@@ -174,8 +164,17 @@ class Surface:
         self.epoch_steps = math.ceil(len(self.images) / self.batch)
 
     def settle(self, before: dict) -> dict[str, Any]:
-        """Nothing is left open."""
-        return {}
+        """As in `Consensus`. A forward has at most `per_device_train_batch_size` images, which may differ later on."""
+        chosen, settled = self.args.micro_batch_size, {}
+        if chosen == "auto":
+
+            def choose() -> int:
+                return self.step.choose_micro_batch_size(self.images.read(0).pixel_values, self.step.micro_batch_size)
+
+            settled = settle_micro_batch(choose, before, self.network, self.args, self.accelerator)
+            chosen = settled["micro_batch_size"]
+        self.step.micro_batch_size = min(int(chosen), self.args.per_device_train_batch_size)
+        return settled
 
     def epoch_updates(self, epoch: int) -> list[list[tuple[int, bool]]]:
         """(image, whether it is flipped) of each update of an epoch, over all processes; the last may have fewer."""
@@ -198,13 +197,17 @@ class Surface:
 
     def accumulate(self, share: Share) -> Losses:
         images = share.images
+
+        def on_device(parts: Iterable[torch.Tensor]) -> torch.Tensor:
+            """One after the other, since what is put together on the host would no longer be pinned."""
+            return torch.cat([part.to(self.accelerator.device, non_blocking=True) for part in parts])
+
         valid = None
         if any(image.valid is not None for image in images):
             everything = (torch.ones_like(image.mask) if image.valid is None else image.valid for image in images)
-            valid = torch.cat(list(everything))
+            valid = on_device(everything)
         tensors = [
-            torch.cat([getattr(image, name) for image in images])
-            for name in ("pixel_values", "mask", "surface_target")
+            on_device(getattr(image, name) for image in images) for name in ("pixel_values", "mask", "surface_target")
         ]
         names = [name for image in images for name in image.names]
         output = self.step.accumulate(*tensors, valid, names, 0.0 if share.idle else 1 / share.count)
@@ -228,8 +231,30 @@ class Surface:
         return look_at_all(self.groups, self.groups.__getitem__, look, self.accelerator, quiet)
 
     def first_note(self, fresh: bool) -> str:
-        """Nothing: what does not fit is halved when it turns out."""
+        """Nothing: what fits was measured."""
         return ""
+
+
+def settle_micro_batch(
+    choose: Callable[[], int], before: dict, model: Any, args: GiftTrainingArguments, accelerator: Accelerator
+) -> dict[str, Any]:
+    """What "auto" comes to: that of the run that wrote `before`, with which this one goes on, else what `choose` says.
+
+    A model of which not even one image fits has its blocks recomputed in the backward, which gives the same bits.
+    """
+    if before:
+        return {"micro_batch_size": before.get("micro_batch_size")}
+    try:
+        return {"micro_batch_size": choose()}
+    except torch.OutOfMemoryError:
+        if args.gradient_checkpointing:
+            raise
+    accelerator.print(
+        "The graph of one image does not fit into memory: its blocks are recomputed in the backward "
+        "(gradient_checkpointing)"
+    )
+    checkpoint_blocks(model)
+    return {"gradient_checkpointing": True, "micro_batch_size": choose()}
 
 
 def look_at_all(
@@ -240,20 +265,12 @@ def look_at_all(
     quiet: bool,
 ) -> list[Losses]:
     """`look` of every group once, in their order, shared by the processes; the first ValueError is raised in all."""
-    mine = range(accelerator.process_index, len(groups), accelerator.num_processes)
+    mine, found = own_share(len(groups), accelerator), []
     bar = {"total": len(mine), "desc": "first look", "unit": "group", "delay": 2, "disable": quiet}
-    found, problem = [], None
-    try:
+    with failing_together(accelerator):
         for index, item in zip(mine, tqdm(read_ahead(read, mine, groups.num_threads), **bar), strict=True):
             found.append((index, look(item)))
-    except (ValueError, OSError) as error:
-        problem = error
-    if accelerator.num_processes > 1:
-        problem = next((each for each in gather_object([problem]) if each is not None), None)
-        found = sorted(gather_object(found), key=lambda pair: pair[0])
-    if problem is not None:
-        raise problem
-    return [losses for _, several in found for losses in several]
+    return [losses for several in in_order(found, accelerator) for losses in several]
 
 
 OBJECTIVES = {"consensus": Consensus, "surface": Surface}

@@ -18,8 +18,8 @@ from accelerate.utils import gather_object
 from torch import Tensor, nn
 
 from gift_peft.group_inputs import check_lambdas
-from gift_peft.losses import masked_l1, require_finite, self_distillation_loss
-from gift_peft.memory import is_out_of_memory, release_memory
+from gift_peft.losses import are_finite, image_terms, name_infinite
+from gift_peft.memory import GraphBudget, is_out_of_memory, local_processes, micro_batch_for, release_memory
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -60,8 +60,9 @@ class SurfaceStep:
     Args:
         model: `PredictedDepth`, as it is or as `accelerator.prepare` gives it; modes and dtypes are left alone.
         lambda_c, lambda_d: weights of the distance to the surface target and of the distillation.
-        micro_batch_size: images per forward; bounds the memory, not the gradient. One process alone halves it when it
-            runs out of memory. Several could not: they would wait for each other's gradients.
+        micro_batch_size: images per forward; bounds the memory, not the gradient. `choose_micro_batch_size` measures
+            it. One process alone halves it when it still runs out of memory. Several could not: they would wait for
+            each other's gradients.
         accelerator: its processes share each update. Without one, this process alone.
     """
 
@@ -80,6 +81,27 @@ class SurfaceStep:
         self.micro_batch_size = micro_batch_size
         self.accelerator: Any = accelerator
         self._world = accelerator.num_processes if accelerator else 1
+
+    def choose_micro_batch_size(self, pixel_values: Tensor, largest: int) -> int:
+        """Set and return the images per forward that memory allows, the least of all processes; at most `largest`.
+
+        Measured with one forward of two images like `pixel_values` (1,3,h,w), or of one where two are too many.
+        Raises torch.OutOfMemoryError, on all processes, where not even one fits.
+        """
+        device = next(self.model.parameters()).device
+        pixels = pixel_values.expand(min(2, largest), -1, -1, -1).to(device)
+        budget = GraphBudget(self.model, local_processes(self._world))
+        with torch.enable_grad(), self._without_exchange():
+            count = budget.measure_few(pixels, self.model)
+        canvas = torch.zeros(1, device="meta").expand(largest, *pixels.shape[-2:])
+        # As on a CPU also elsewhere: no graph is kept from one forward to the next, so all of the room may go into it.
+        chosen = count and min(largest, micro_batch_for(budget.images(pixels, canvas), count, largest, on_cuda=False))
+        if self._world > 1:
+            chosen = int(self.accelerator.gather(torch.tensor([chosen], device=device)).min())
+        if chosen == 0:
+            raise torch.OutOfMemoryError("not even one image fits into memory")
+        self.micro_batch_size = chosen
+        return chosen
 
     def accumulate(
         self,
@@ -125,73 +147,91 @@ class SurfaceStep:
             raise ValueError("the model has no trainable parameter: load the adapter with is_trainable=True")
         for p in parameters:
             p.grad = None
-        device = parameters[0].device
-        # The two terms, and whether something is wrong; Apple's GPUs have no float64.
-        means = torch.zeros(3, dtype=torch.float32 if device.type == "mps" else torch.float64, device=device)
+        device, start, finite = parameters[0].device, 0, []
+        # The two terms, and whether something is wrong.
+        means = torch.zeros(3, dtype=torch.promote_types(parameters[0].dtype, torch.float32), device=device)
         problem, loss = None, torch.zeros(())
-        for start in range(0, len(mask), self.micro_batch_size):
-            batch, is_last = slice(start, start + self.micro_batch_size), start + self.micro_batch_size >= len(mask)
-            parts = [None if part is None else part[batch].to(device) for part in (pixel_values, mask, target, valid)]
-            with nullcontext() if is_last else self._without_exchange():
+        while start < len(mask):
+            batch = slice(start, start + self.micro_batch_size)
+            start += self.micro_batch_size
+            parts = [
+                None if part is None else part[batch].to(device, non_blocking=True)
+                for part in (pixel_values, mask, target, valid)
+            ]
+            with nullcontext() if start >= len(mask) else self._without_exchange():
                 try:
-                    terms = self._terms(*parts, None if names is None else names[batch])
+                    terms, flags = self._terms(*parts)
                 except ValueError as error:
                     problem = error
                     break
+                finite.append(flags)
                 means[:2] += weight * terms.detach()
                 # DDP divides the sum over the processes by their number.
                 loss = self._world * weight * (self.lambda_c * terms[0] + self.lambda_d * terms[1])
-                if not is_last:
+                if start < len(mask):
                     self._backward(loss)
-        self._raise_everywhere(problem, means)
+        if self._world > 1:
+            self._agree(problem, means, finite, names)
+        elif problem is not None:
+            raise problem
         self._backward(loss)
         gradients = [p.grad for p in parameters if p.grad is not None]
-        if not torch.nn.utils.get_total_norm(gradients, math.inf).isfinite():
-            raise ValueError("the gradient of this update has NaN or infinite values")
-        consistency, distillation, _ = means.tolist()
+        norm = torch.nn.utils.get_total_norm(gradients, math.inf)
+        facts = torch.cat([means, norm.to(means)[None], *self._flat(finite)])
+        consistency, distillation, _, norm, *flags = (
+            facts.tolist()
+        )  # the one place where the host waits for the device
+        self._check_finite(flags, names)
         total = self.lambda_c * consistency + self.lambda_d * distillation
+        if not math.isfinite(total):  # differences of finite predictions overflow
+            raise ValueError("the loss of this update is NaN or infinite")
+        if not math.isfinite(norm):
+            raise ValueError("the gradient of this update has NaN or infinite values")
         return SurfaceStepOutput(total, consistency, distillation)
 
     def _terms(
-        self,
-        pixel_values: Tensor,
-        mask: Tensor,
-        target: Tensor,
-        valid: Tensor | None,
-        names: Sequence[str] | None,
-    ) -> Tensor:
-        """(2,): the sums over a micro-batch of the distance to the surface target and of the distillation."""
+        self, pixel_values: Tensor, mask: Tensor, target: Tensor, valid: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Of a micro-batch: (2,), the sums of the distance to the surface target and of the distillation; and (2,n),
+        which predictions, and which targets, are finite.
+        """
         prediction = self.model(pixel_values)
         if prediction.shape != mask.shape:
             made, sizes = "x".join(map(str, prediction.shape[1:])), "x".join(map(str, mask.shape[1:]))
             raise ValueError(f"the prediction is {made} but mask and target are {sizes}: resize them to its size")
-        require_finite(prediction.detach(), "the prediction", names)
-        require_finite(target, "the surface target", names)
-        regions = mask if valid is None else mask & valid
-        terms = []
-        for index, region in enumerate(regions):
-            one = slice(index, index + 1)
-            other = self_distillation_loss(
-                prediction[one], target[one], mask[one], None if valid is None else valid[one]
-            )
-            inside = masked_l1(prediction[index], target[index], region) if region.any() else torch.zeros_like(other)
-            terms.append(torch.stack([inside, other]))
-        return torch.stack(terms).sum(0)
+        flags = torch.stack([are_finite(prediction), are_finite(target)])
+        return image_terms(prediction, target, mask, valid).sum(0), flags
 
-    def _raise_everywhere(self, problem: ValueError | None, means: Tensor) -> None:
-        """Sum `means` over the processes, in place; where one has a problem, or their loss is not finite, all raise.
+    def _agree(
+        self, problem: ValueError | None, means: Tensor, finite: list[Tensor], names: Sequence[str] | None
+    ) -> None:
+        """Sum `means` over the processes, in place; where one has a problem, all raise it.
 
         Before the last backward, in which they would wait for each other.
         """
-        means[2] = float(problem is not None)
-        if self._world > 1:
-            means.copy_(self.accelerator.reduce(means, "sum"))
-            if means[2]:
-                problem = next(each for each in gather_object([problem]) if each is not None)
-        if problem is not None:
-            raise problem
-        if not means.isfinite().all():  # differences of finite predictions overflow
-            raise ValueError("the loss of this update is NaN or infinite")
+        flags = self._flat(finite)
+        wrong = problem is not None or (torch.cat(flags) == 0).any()
+        means[2] = wrong
+        means.copy_(self.accelerator.reduce(means, "sum"))
+        if not means[2]:
+            return
+        if problem is None:
+            try:
+                self._check_finite(torch.cat(flags).tolist() if flags else [], names)
+            except ValueError as error:
+                problem = error
+        raise next(each for each in gather_object([problem]) if each is not None)
+
+    @staticmethod
+    def _flat(finite: list[Tensor]) -> list[Tensor]:
+        """The flags of all micro-batches, as numbers: first of the predictions, then of the targets."""
+        return [flags[row].float() for row in range(2) for flags in finite]
+
+    @staticmethod
+    def _check_finite(flags: list[float], names: Sequence[str] | None) -> None:
+        half = len(flags) // 2
+        name_infinite(flags[:half], "the prediction", names)
+        name_infinite(flags[half:], "the surface target", names)
 
     def _backward(self, loss: Tensor) -> None:
         if self.accelerator is None:

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from accelerate import PartialState
-from accelerate.utils import gather_object, parse_flag_from_env
+from accelerate.utils import parse_flag_from_env
 from PIL import Image
 from tqdm import tqdm
 
+from gift_peft.dataset.digests import DigestCache, default_digests_dir
 from gift_peft.dataset.gift_i import gift_i_splits, load_gift_i
 from gift_peft.dataset.proxies import (
     EARLIER,
@@ -30,20 +31,18 @@ from gift_peft.dataset.proxies import (
     difference,
     has_earlier_set,
     make_header,
-    mask_digests,
-    picture_digests,
     proxies_command,
     read_header,
     write_proxies,
     write_surface,
 )
-from gift_peft.dataset.rows import parsed
 from gift_peft.evaluation.surface_check import describe, describe_nothing, surface_lines
 from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import pixel_settings, resize_mask
 from gift_peft.rules import UNKNOWN, GroupPictures
 from gift_peft.surface_targets import SurfaceTarget, paint_fills, surface_target
+from gift_peft.training.shares import failing_together, own_share
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -108,36 +107,35 @@ def make_proxies(
     if has_earlier_set(folder) and Path(base).is_dir():
         earlier = {EARLIER: earlier_revision(base)}
 
-    def make(row: GroupPictures, split: str) -> None:
-        if surface is not None and row.group_id.endswith(SURFACE_SUFFIX):
-            raise ValueError(f"group {row.group_id}: rename it; so the surface targets of another group are called")
+    def make(groups: DigestCache, index: int, split: str) -> None:
+        group_id, names = groups.facts(index)
+        if surface is not None and group_id.endswith(SURFACE_SUFFIX):
+            raise ValueError(f"group {group_id}: rename it; so the surface targets of another group are called")
+        digests, row = groups.read(index)
         store = ProxyStore(str(folder), named, split, header | earlier, command)
-        file, pixels = f"{row.group_id}.safetensors", picture_digests(row)
-        known = header | pixels
-        holds = partial(_is_current, names=row.names)
+        file = f"{group_id}.safetensors"
+        known = header | digests.pictures
+        holds = partial(_is_current, names=names)
         if (overwrite and surface is None) or not holds(store.path(file), known | earlier, command, "proxy"):
+            row = row or groups.groups[index]
             write_proxies(store.place(file), known, *_predict_row(model, row, batch_size))
         if surface is None:
             return
-        file = f"{row.group_id}{SURFACE_SUFFIX}.safetensors"
-        known = surface_header | pixels | mask_digests(row)
+        file = f"{group_id}{SURFACE_SUFFIX}.safetensors"
+        known = surface_header | digests.pictures | digests.masks
         if overwrite or not holds(store.path(file), known | earlier, surface_command, "surface target"):
-            proxies, reference = store.read(row.group_id, row.names, pixels)
-            row = replace(row, reference_proxy=reference)
+            proxies, reference = store.read(group_id, names, digests.pictures)
+            row = replace(row or groups.groups[index], reference_proxy=reference)
             *targets, told = _surface_row(model, row, proxies, surface, batch_size)
             write_surface(store.place(file), known | {TOLD: told}, *targets)
 
     what = "proxies" if surface is None else "surface targets"
-    problem = None
-    try:
+    with failing_together(state):
         for split in splits or gift_i_splits(dataset_path):
-            dataset = parsed(load_gift_i(dataset_path, split))
-            mine = range(state.process_index, len(dataset), state.num_processes)
-            for index in tqdm(mine, desc=f"{what}, {split}", unit="group", delay=2, disable=not state.is_main_process):
-                make(dataset[index], split)
-    except (ValueError, OSError) as error:
-        problem = error
-    _raise_everywhere(problem, state)
+            groups = DigestCache(load_gift_i(dataset_path, split), default_digests_dir())
+            bar = {"desc": f"{what}, {split}", "unit": "group", "delay": 2, "disable": not state.is_main_process}
+            for index in tqdm(own_share(len(groups), state), **bar):
+                make(groups, index, split)
     return folder / named
 
 
@@ -238,11 +236,3 @@ def _surface_row(
         return target, target_flipped, told
     except ValueError as error:
         raise ValueError(f"group {row.group_id}: {error}") from None
-
-
-def _raise_everywhere(problem: Exception | None, state) -> None:
-    """Raise the first process's problem in all, so that none waits for one that has stopped."""
-    problems = [problem] if state.num_processes == 1 else gather_object([problem])
-    problem = next((problem for problem in problems if problem is not None), None)
-    if problem is not None:
-        raise problem

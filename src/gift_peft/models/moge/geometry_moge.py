@@ -21,7 +21,7 @@ NEWTON_STEPS = 8
 
 def view_plane(height: int, width: int, device: torch.device) -> Tensor:
     """(H,W,2) float64: pixel centers as u, v over half the diagonal of a picture, the center is 0."""
-    diagonal = math.hypot(height, width)
+    diagonal = (height**2 + width**2) ** 0.5  # not math.hypot, at which an exporter fixes the size
     v, u = (torch.arange(side, device=device, dtype=torch.float64) * 2 + 1 - side for side in (height, width))
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1) / diagonal
 

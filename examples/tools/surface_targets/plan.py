@@ -23,14 +23,13 @@ class Rule:
 
 @dataclass(frozen=True)
 class Trial:
-    """One training. `rule` None is the paper's objective; `train` and `score` are (set, part) pairs."""
+    """One training. `rule` None is the paper's objective; `train` and `score` are (set, `part`) pairs."""
 
     name: str
-    train: tuple[tuple[str, str], ...]
-    score: tuple[tuple[str, str], ...]
+    train: tuple[tuple[str, str | int], ...]
+    score: tuple[tuple[str, str | int], ...]
     rule: Rule | None = Rule()
     photos: str = "all"
-    count: int = 0
     lambda_c: float = 2.0
     lambda_d: float = 0.9
     rate: float = 2e-4
@@ -43,13 +42,18 @@ class Trial:
         return asdict(self)
 
 
-def part(groups: list[Observed], name: str) -> list[Observed]:
-    """A part of a set: "all", every fourth group, or the others."""
-    return {"all": groups, "fourth": groups[::4], "others": [g for i, g in enumerate(groups) if i % 4]}[name]
+def part(groups: list[Observed], which: str | int) -> list[Observed]:
+    """A part of a set: "all", every fourth group, the others, or the first so many, the kinds in turn."""
+    if isinstance(which, int):
+        if len(groups) < which:
+            raise SystemExit(f"{len(groups)} groups are rendered: render {which}")
+        return sorted(groups, key=lambda group: group.name.split("_")[-1])[:which]
+    return {"all": groups, "fourth": groups[::4], "others": [g for i, g in enumerate(groups) if i % 4]}[which]
 
 
 TRAIN = (("train", "all"),)
 OLD = (("validation", "all"),)
+BOTH = (*TRAIN, ("singles", 318))
 FRESH = (("fresh_1", "all"), ("fresh_2", "all"), ("fresh_3", "all"))
 
 
@@ -64,6 +68,10 @@ HIGH = {"quantile": 0.8, "tau": 0.7}  # without fills
 
 def report(name: str, **options) -> Trial:
     return Trial(name, TRAIN, FRESH, **CHOSEN | options)
+
+
+def single(name: str, count: int) -> Trial:
+    return Trial(name, (("singles", count),), FRESH, updates=2196, **CHOSEN)
 
 
 PAPER = {"rule": None, "lambda_c": 1.0, "flips": False}
@@ -88,8 +96,37 @@ STAGES = {
         report("mean shift alone", rule=Rule("shift")),
         report("true depth (upper bound)", rule=Rule("truth")),
         report("fills alone", rule=Rule(observations=False)),
-        report("quantile for all", rule=Rule("quantile")),
-        report("plane for all", rule=Rule("plane")),
         report("paper's objective, lambda_c 1.4", **PAPER | {"lambda_c": 1.4}),
+        report("plane for all", rule=Rule("plane")),
+        report("quantile for all", rule=Rule("quantile")),
+        report("fills alone, plane", rule=Rule("plane", observations=False)),
+        report("fills alone, quantile", rule=Rule("quantile", observations=False)),
+        report("without fills, plane", rule=Rule("plane", fills=0, **HIGH)),
+        report("without fills, quantile", rule=Rule("quantile", fills=0, **HIGH)),
+    ],
+    # The observations of each training group on which the base errs most.
+    "hallucinating": [
+        report("surface targets, worse half", photos="worse half"),
+        report("paper's objective, worse half", photos="worse half", **PAPER),
+    ],
+    # Photos of scenes of their own in which the surface cannot be seen; all with the updates of the main runs.
+    "singles": [
+        single("318 single photos", 318),
+        single("50 single photos", 50),
+        single("100 single photos", 100),
+        single("1000 single photos", 1000),
+        Trial("one covered photo of each group", TRAIN, FRESH, photos="one covered", updates=2196, **CHOSEN),
+    ],
+    # What true depth as the target does not reach either: more photos, more updates.
+    "more": [
+        report("surface targets, 24 epochs", epochs=24),
+        Trial("groups and 318 single photos, 18 epochs", BOTH, FRESH, **CHOSEN | {"epochs": 18}),
+    ],
+    # The paper's objective over the grid, on the older validation groups.
+    "paper's grid": [
+        first("consensus lambda_c 1.4 8 epochs", **PAPER | {"lambda_c": 1.4}, epochs=8),
+        first("consensus flips 8 epochs", **PAPER | {"flips": True}, epochs=8),
+        first("consensus rate 4e-4 8 epochs", **PAPER, rate=4e-4, epochs=8),
+        first("consensus lambda_c 2 8 epochs", **PAPER | {"lambda_c": 2.0}, epochs=8),
     ],
 }

@@ -159,6 +159,8 @@ def choose(groups: list[Observed], photos: str) -> list[Observed]:
         return [group.only([i]) for group in groups for i in np.flatnonzero(~group.seen)]
     if photos == "seen singles":
         return [group.only([i]) for group in groups for i in np.flatnonzero(group.seen)]
+    if photos == "one covered":  # one of each group, in which the surface shows
+        return [group.only(np.flatnonzero(group.seen)[:1]) for group in groups if group.seen.any()]
     if photos == "singles":
         return [group.only([i]) for group in groups for i in range(len(group.images))]
     if photos == "worse half":  # at least two, by the base's own error inside the target
@@ -212,8 +214,6 @@ def run(trial: plan.Trial, seed: int, sets: dict[str, list[Observed]], out: Path
         return
     groups = [group for name, part in trial.train for group in plan.part(sets[name], part)]
     groups = choose(groups, trial.photos)
-    if trial.count:
-        groups = groups[: trial.count]
     model, seconds = train(trial, groups, seed, out)
     result = {"trial": trial.describe(), "seed": seed, "photos": sum(len(group.images) for group in groups)}
     result |= {"groups": len(groups), "train_seconds": seconds, "sets": {}}
@@ -230,11 +230,11 @@ def main():
     parser.add_argument("--renders", type=Path, default=Path("renders"))
     parser.add_argument("--out", type=Path, default=Path("trials"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--only", help="names that contain this")
+    parser.add_argument("--only", help="the one of this name")
     args = parser.parse_args()
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "2")))
     args.out.mkdir(parents=True, exist_ok=True)
-    trials = [trial for trial in plan.STAGES[args.stage] if not args.only or args.only in trial.name]
+    trials = [trial for trial in plan.STAGES[args.stage] if args.only in (None, trial.name)]
     needed = sorted({name for trial in trials for name, _ in (*trial.train, *trial.score)})
     sets = {name: read_set(args.renders / name, BASE) for name in needed}
     for seed in args.seeds:

@@ -29,28 +29,28 @@ def stills():
 def watch(clip: FaultClip, mask):
     """(seconds, advice) of each frame, and the processor's seconds."""
     coach, start = Coach(mask), time.process_time()
-    advices = [
+    spoken = [
         (frame.seconds, coach.see(frame.index, frame.seconds, frame.pixels)) for frame in Clip(clip.path).frames()
     ]
-    return advices, time.process_time() - start
+    return spoken, time.process_time() - start
 
 
-def judge(clip: FaultClip, advices) -> tuple[bool, int, int]:
+def judge(clip: FaultClip, spoken) -> tuple[bool, int, int]:
     """Whether the fault was told, and no photo taken of it; views with a photo; good frames with a warning."""
-    photos = [at for at, advice in advices if advice.photo is not None]
+    photos = [at for at, advice in spoken if advice.photo is not None]
     told = True
     if clip.fault:
         first, last = clip.spoiled
-        moved_on = min((at for at, advice in advices if advice.new_group), default=last)
+        moved_on = min((at for at, advice in spoken if advice.new_group), default=last)
         codes = TELLS.get(clip.fault, {clip.fault})
-        told = any(first - 0.7 <= at <= last + LATE and advice.codes & codes for at, advice in advices)
+        told = any(first - 0.7 <= at <= last + LATE and advice.codes & codes for at, advice in spoken)
         told &= not any(first <= at <= min(last, moved_on) for at in photos)
     found = sum(any(start <= at <= end + LATE for at in photos) for start, end in clip.views)
     alarms = 0
     for start, end in clip.good:
         # The same view again after somebody has passed: that nothing new shows is true.
         true = set() if (start, end) in clip.views else {"unchanged"}
-        alarms += sum(bool(advice.codes - true) for at, advice in advices if start <= at < end)
+        alarms += sum(bool(advice.codes - true) for at, advice in spoken if start <= at < end)
     return told, found, alarms
 
 
@@ -61,15 +61,15 @@ def test_faults_are_told_before_the_photo_and_little_else_is(stills, tmp_path):
     for number, seed in enumerate(SEEDS):
         fault = (*FAULTS, None)[number % (len(FAULTS) + 1)]
         clip = make_fault_clip(seed, stills[number // 5 % len(stills)], tmp_path, fault)
-        advices, seconds = watch(clip, clip.mask if number // 10 % 2 == 0 else None)
-        right, taken, wrong = judge(clip, advices)
+        spoken, seconds = watch(clip, clip.mask if number // 10 % 2 == 0 else None)
+        right, taken, wrong = judge(clip, spoken)
         clip.path.unlink()
         wanted[fault] += 1
         told[fault] += right
         found, views = found + taken, views + len(clip.views)
         alarms += wrong
-        good += sum(start <= at < end for at, _ in advices for start, end in clip.good)
-        frames, spent = frames + len(advices), spent + seconds
+        good += sum(start <= at < end for at, _ in spoken for start, end in clip.good)
+        frames, spent = frames + len(spoken), spent + seconds
         if not right or taken < len(clip.views) or wrong:
             print(
                 f"clip {seed}: {fault} told {right}, {taken} of {len(clip.views)} views, {wrong} alarms; {clip.made}"

@@ -20,13 +20,13 @@ def codes(advice) -> set[str]:
     return {item.code for item in advice.warnings}
 
 
-def told(advices, hold) -> set[str]:
-    return set().union(*(codes(advice) for advice in advices[hold[0] : hold[1] + 1]))
+def told(spoken, hold) -> set[str]:
+    return set().union(*(codes(advice) for advice in spoken[hold[0] : hold[1] + 1]))
 
 
-def photos(advices, holds) -> list[int]:
+def photos(spoken, holds) -> list[int]:
     """In which still view each photo was taken."""
-    places = [index for index, advice in enumerate(advices) if advice.photo is not None]
+    places = [index for index, advice in enumerate(spoken) if advice.photo is not None]
     return [next(k for k, (first, last) in enumerate(holds) if first <= place <= last) for place in places]
 
 
@@ -38,10 +38,10 @@ def test_a_good_series_is_taken_by_itself_without_a_word(known_mask):
         made.hold(before, 1.2)
         if after is not None:
             made.fade(before, after)
-    advices = watch(made, mask if known_mask else None)
-    assert photos(advices, made.holds) == [0, 1, 2, 3]
-    assert not set().union(*map(codes, advices))
-    assert advices[-1].changed > (0.8 if known_mask else 0.8 * mask.mean()) and advices[-1].drift < 0.3
+    spoken = watch(made, mask if known_mask else None)
+    assert photos(spoken, made.holds) == [0, 1, 2, 3]
+    assert not set().union(*map(codes, spoken))
+    assert spoken[-1].changed > (0.8 if known_mask else 0.8 * mask.mean()) and spoken[-1].drift < 0.3
 
 
 def defocused(picture):
@@ -66,10 +66,10 @@ def test_a_fault_is_told_and_no_photo_of_it_is_taken(fault, seed):
     made.hold(FAULTS[fault](pictures[1], pictures[0]), 1.2)
     made.cross(pictures[2], (0, 30), 0.5)
     made.hold(pictures[2], 1.2)
-    advices = watch(made, mask)
-    assert fault in told(advices, made.holds[1])
-    assert photos(advices, made.holds) == [0, 2]
-    assert not told(advices, made.holds[0])
+    spoken = watch(made, mask)
+    assert fault in told(spoken, made.holds[1])
+    assert photos(spoken, made.holds) == [0, 2]
+    assert not told(spoken, made.holds[0])
 
 
 def test_a_camera_that_stays_moved_begins_a_new_group():
@@ -79,9 +79,9 @@ def test_a_camera_that_stays_moved_begins_a_new_group():
     made.hold(pushed(pictures[0], 5), 4.0)
     made.hold(pushed(pictures[1], 5), 1.5)
     coach = Coach(mask)
-    advices = [coach.see(index, index / RATE, frame[..., ::-1].copy()) for index, frame in enumerate(made.frames)]
-    assert sum(advice.new_group for advice in advices) == 1
-    assert photos(advices, made.holds) == [0, 1, 2]
+    spoken = [coach.see(index, index / RATE, frame[..., ::-1].copy()) for index, frame in enumerate(made.frames)]
+    assert sum(advice.new_group for advice in spoken) == 1
+    assert photos(spoken, made.holds) == [0, 1, 2]
     carried = pushed(mask.astype(np.uint8) * 255, 5) > 127
     assert (carried & coach.mask_here).sum() > 0.95 * (carried | coach.mask_here).sum()
 
@@ -94,10 +94,10 @@ def test_enough_when_changes_show_nothing_new_or_there_are_as_many_as_asked_for(
         made.hold(before, 1.4)
         if after is not None:
             made.fade(before, after)
-    advices = watch(made, mask)
-    assert photos(advices, made.holds) == [0, 1, 2]
-    assert all("unchanged" in told(advices, hold) for hold in made.holds[3:])
-    assert advices[-1].enough and not advices[made.holds[4][1]].enough
+    spoken = watch(made, mask)
+    assert photos(spoken, made.holds) == [0, 1, 2]
+    assert all("unchanged" in told(spoken, hold) for hold in made.holds[3:])
+    assert spoken[-1].enough and not spoken[made.holds[4][1]].enough
     few = watch(made, mask, most=2)
     assert any(advice.enough for advice in few[: made.holds[1][1] + 1]) and photos(few, made.holds) == [0, 1]
 
@@ -108,10 +108,10 @@ def test_somebody_who_passes_is_no_change_at_once_and_a_long_wait_is():
     made.hold(pictures[0], 1.2)
     made.cross(pictures[0], (0, 20), 0.6)
     made.hold(pictures[0], 4.0)
-    advices = watch(made, mask)
+    spoken = watch(made, mask)
     first = made.holds[1][0]
-    assert not told(advices, (first, first + round(0.6 * RATE)))
-    assert "unchanged" in told(advices, made.holds[1]) and photos(advices, made.holds) == [0]
+    assert not told(spoken, (first, first + round(0.6 * RATE)))
+    assert "unchanged" in told(spoken, made.holds[1]) and photos(spoken, made.holds) == [0]
 
 
 def test_a_slow_change_of_the_light_is_no_fault_and_a_step_is_one_until_it_lasts():
@@ -120,23 +120,23 @@ def test_a_slow_change_of_the_light_is_no_fault_and_a_step_is_one_until_it_lasts
     made.hold(pictures[0], 3.0)
     made.fade(*pictures)
     made.hold(pictures[1], 1.2)
-    advices = watch(made, mask)
-    assert not told(advices, made.holds[1]) and photos(advices, made.holds) == [0, 1]
+    spoken = watch(made, mask)
+    assert not told(spoken, made.holds[1]) and photos(spoken, made.holds) == [0, 1]
     made = Making(SIZE)
     made.hold(pictures[0], 1.2)
     made.hold(0.6 * pictures[1], 4.0)
-    advices = watch(made, mask)
-    assert "exposure_changed" in told(advices, made.holds[1]) and photos(advices, made.holds) == [0, 1]
-    taken = max(index for index, advice in enumerate(advices) if advice.photo is not None)
-    assert taken - made.holds[1][0] > 2 * RATE and not codes(advices[-1]) & {"exposure_changed"}
+    spoken = watch(made, mask)
+    assert "exposure_changed" in told(spoken, made.holds[1]) and photos(spoken, made.holds) == [0, 1]
+    taken = max(index for index, advice in enumerate(spoken) if advice.photo is not None)
+    assert taken - made.holds[1][0] > 2 * RATE and not codes(spoken[-1]) & {"exposure_changed"}
 
 
 def test_white_from_the_beginning_is_told_first():
     pictures, mask = views(7, SIZE, 1)
     made = Making(SIZE)
     made.hold(np.clip(pictures[0] * 4.0, 0, 255), 1.5)
-    advices = watch(made, mask)
-    assert "bright" in told(advices, made.holds[0]) and not photos(advices, made.holds)
+    spoken = watch(made, mask)
+    assert "bright" in told(spoken, made.holds[0]) and not photos(spoken, made.holds)
 
 
 def test_a_person_may_ask_for_a_photo_and_for_the_reference():

@@ -126,6 +126,13 @@ def test_a_folder_that_cannot_be_written_is_told_once(raw, folder, monkeypatch, 
     assert caplog.text.count("No space left") == 1
 
 
+def test_a_folder_that_cannot_be_is_not_called_damaged(raw, folder, caplog):
+    folder.write_text("a file of somebody")
+    with caplog.at_level(logging.WARNING, "gift_peft"):
+        assert read(raw, folder)[1] is not None
+    assert "damaged" not in caplog.text and caplog.text.count("their digests cannot be kept") == 1
+
+
 def test_a_picture_that_is_gone_or_damaged_is_named(raw, folder):
     cache = DigestCache(load_gift_i(raw, "train"), folder)
     cache.read(0)

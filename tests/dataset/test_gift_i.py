@@ -253,6 +253,23 @@ def test_a_changed_tree_is_read_again(tmp_path, load):
     assert rows()[0]["surface"] == 0
 
 
+def test_a_tree_changed_under_its_old_time_is_read_again(tmp_path):
+    """As rsync leaves it, and of the same size."""
+    folder = write_group(tmp_path / "raw/train/g", 2, 0)
+    labels = np.zeros((60, 80), np.uint8)
+    labels[10:30, 10:30], labels[40:, :] = 2, 7
+    for index in range(2):
+        save_mask(folder / "masks" / f"{index}.png", labels)
+    facts = folder / "group.yaml"
+    for target in (2, 7):
+        before = facts.stat() if facts.exists() else None
+        facts.write_text(f"mask_class: {target}\n")
+        if before is not None:
+            os.utime(facts, ns=(before.st_atime_ns, before.st_mtime_ns))
+        row = load_gift_i(tmp_path / "raw", "train")[0]
+        assert np.array_equal(np.asarray(row["masks"][0]) == 255, labels == target)
+
+
 def test_natural_order_and_duplicates(tmp_path, caplog):
     folder = write_group(tmp_path / "raw" / "train" / "g", 12, 0)
     assert load_gift_i(tmp_path / "raw", "train")[0]["image_names"] == [f"{index}.png" for index in range(12)]

@@ -14,12 +14,13 @@ from helpers.records import one_line
 from helpers.tiny import SIZE, tiny_model, tiny_processor, write_base
 from PIL import Image
 
+from gift_peft.dataset import shares
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.dataset.proxies import SurfaceSettings, default_proxies_dir, read_header, write_proxies
 from gift_peft.dataset.tensors import collate_group
 from gift_peft.models import loading
 from gift_peft.models.identity import teacher_id, teacher_revision
-from gift_peft.training import shares, teacher
+from gift_peft.training import teacher
 from gift_peft.training.teacher import make_proxies
 
 pytestmark = pytest.mark.usefixtures("fresh_cache")

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 from gift_peft.cli import main
 from gift_peft.deploy.look_ahead import predict_ahead
 from gift_peft.deploy.sensor import fill_sensor_depth
+from gift_peft.deploy.video import predict_video
 from gift_peft.models.loading import DepthModel
 
 pytestmark = [
@@ -263,6 +265,26 @@ def test_a_clip_of_others_is_kept(demo, work, capsys):
     code, _, err = run(demo, capsys, "--video=in.mp4")
     assert code == 1 and "in_depth.mp4 was not written by gift-peft predict and is kept" in err
     assert (work / "out" / "in_depth.mp4").read_text() == "mine"
+
+
+def test_a_frame_without_depth_is_named_by_its_own_number(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_clip("in.mp4", [np.zeros((64, 96, 3), np.uint8)] * 5)
+
+    class Model:
+        adapted, kind = False, "depth"
+
+        def inputs(self, pictures):
+            return np.zeros((len(pictures), 1))
+
+        def depths_of(self, pixels, sizes, names, base):
+            if names[-1].endswith("3"):
+                raise ValueError(f"{names[-1]}: the prediction has NaN or infinite values")
+            return [np.arange(np.prod(size), dtype=np.float32).reshape(size) for size in sizes]
+
+    with pytest.raises(ValueError, match=r"^in\.mp4, frame 3: "):
+        predict_video("in.mp4", Model(), "out", batch_size=2, progress=False)
+    assert not list(Path("out").iterdir())
 
 
 def test_a_mask_of_another_shape_leaves_no_clip(demo, work, capsys):

@@ -5,6 +5,8 @@ import threading
 import numpy as np
 import pytest
 import torch
+from accelerate import Accelerator
+from helpers.runs import run_in_processes
 from helpers.tiny import SIZE, tiny_model, tiny_processor
 
 from gift_peft.dataset.gift_i import load_gift_i
@@ -123,6 +125,21 @@ def test_an_error_ends_it(monkeypatch, where):
     with pytest.raises(ValueError, match=r"group group-1: "):
         evaluate(groups)
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("scoring")]
+
+
+def test_what_one_process_stumbles_over_all_report(tmp_path):
+    groups = [make_group(seed) for seed in range(3)]
+    groups[1].names = groups[1].names[:-1]
+
+    def start(rank):
+        try:
+            evaluate_gift_i(groups, adapted_of, lambda pixels: pixels[:, 0], accelerator=Accelerator(cpu=True))
+        except ValueError as error:
+            (tmp_path / str(rank)).write_text(str(error))
+
+    assert run_in_processes(start) == [0, 0]
+    told = [(tmp_path / str(rank)).read_text() for rank in range(2)]
+    assert told[0] == told[1] and told[0].startswith("group group-1: ")
 
 
 def test_both_references_are_one_prediction(prepared):

@@ -1,7 +1,9 @@
 """Photos that are registered twice, with other masks, are searched for features once; that changes no figure."""
 
+import gc
 import json
 import shutil
+import weakref
 
 import cv2
 import numpy as np
@@ -10,6 +12,7 @@ from helpers.photos import SETTINGS, capture, frames, motion
 
 from gift_peft.prepare import matching
 from gift_peft.prepare.matching import Frame
+from gift_peft.prepare.photo import Photo
 from gift_peft.prepare.prepare import prepare_gift_i
 from gift_peft.prepare.settings import PrepareSettings
 
@@ -64,7 +67,20 @@ def test_descriptors_are_sifts_own():
     points, found = frame.features(0.0, outside_only=False)
     assert len(keypoints) > 50 and found.dtype == np.float32
     assert np.array_equal(points, [keypoint.pt for keypoint in keypoints]) and np.array_equal(found, descriptors)
-    other = Frame(picture, ~mask, SETTINGS, frame)
+    other = Frame(picture, ~mask, SETTINGS, frame.picture)
     anew = Frame(picture, ~mask, SETTINGS)
     for one, two in zip(other.features(low), anew.features(low), strict=True):
         assert np.array_equal(one, two) and len(one) < len(points)
+
+
+def test_of_a_photo_that_waits_for_its_second_time_no_frame_is_kept():
+    """Its masks and brightness in float32 are 8 bytes for each pixel of each photo of a group."""
+    picture, mask, _ = frames(3)
+    photo = Photo(None, picture, picture, mask)
+    frame = photo.frame(mask, SETTINGS, again=True)
+    found, kept = frame.features(0.0, outside_only=False), weakref.ref(frame)
+    del frame
+    gc.collect()
+    assert kept() is None
+    again = photo.frame(~mask, SETTINGS, again=False)
+    assert again.picture.features[0] is not None and np.array_equal(again.features(0.0, False)[0], found[0])

@@ -9,7 +9,8 @@ from helpers.tiny import SIZE, tiny_processor, write_raw_tree
 
 from gift_peft.adapters.folder import read_gift
 from gift_peft.dataset.gift_i import load_gift_i
-from gift_peft.dataset.loader import PreparedGroups
+from gift_peft.dataset.loader import PreparedGroups, PreparedImages
+from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.training import checkpoints, start, train, upload
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.objectives import Consensus
@@ -64,6 +65,17 @@ def test_everything_that_an_update_takes_is_pinned_for_cuda(base_dir, raw_tree, 
     inputs = objective._read(0).inputs
     tensors = [inputs.pixel_values, inputs.mask, inputs.target, *inputs.pairs]
     assert all(id(tensor) in pinned for tensor in tensors)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_single_images_are_pinned_as_they_are_shown(base_dir, raw_tree, monkeypatch, flip):
+    surface = SurfaceSettings(fills=0)
+    make_proxies(base_dir, raw_tree, splits=["train"], size=SIZE, surface=surface)
+    rows = load_gift_i(raw_tree, "train", teacher=base_dir, size=SIZE, surface=surface)
+    pinned = []
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda tensor: pinned.append(id(tensor)) or tensor)
+    image = PreparedImages(PreparedGroups(rows, tiny_processor(), SIZE, pin=True)).read(0, flip)
+    assert all(id(tensor) in pinned for tensor in (image.pixel_values, image.mask, image.surface_target))
 
 
 def test_processes_wait_longer_for_each_other_than_a_watchdog(tmp_path, monkeypatch):

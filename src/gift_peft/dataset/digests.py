@@ -147,14 +147,14 @@ def _mark(item: dict) -> list | None:
 
 
 def _load(path: Path) -> GroupDigests | None:
-    """An entry; None without one, or if it is damaged."""
+    """An entry; None without one that can be read, or if it is damaged."""
     try:
         entry = json.loads(path.read_text(encoding="utf-8"))
         if entry["checksum"] == _checksum(entry["digests"]):
             return GroupDigests(**entry["digests"])
-    except FileNotFoundError:
+    except OSError:  # there is none; or it cannot be read, and whoever makes it again says why
         return None
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (ValueError, LookupError, TypeError) as error:
         logger.debug("%s: %s", path, error)
     logger.warning("%s is damaged: decoding the group again", path)
     return None

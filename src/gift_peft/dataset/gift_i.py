@@ -59,7 +59,7 @@ FEATURES = Features(
 
 @dataclass
 class GiftIConfig(datasets.BuilderConfig):
-    """Adds the tree's listing (names, sizes, times) to the cache key: a changed folder is read again.
+    """Adds the tree's listing (names, sizes, times, inodes) to the cache key: a changed folder is read again.
 
     `datasets` keys the cache by the files it guesses from split words in path names, which may be some or none.
     `empty_masks` ("refuse" or "allow") says what photos without a target are in groups whose others have one.
@@ -122,7 +122,9 @@ def _listing_digest(folder: str) -> str:
             except OSError as error:  # a link that leads nowhere
                 digest.update(f"{os.path.relpath(root, folder)}/{name} {error.errno}\n".encode())
                 continue
-            digest.update(f"{os.path.relpath(root, folder)}/{name} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+            # Of a file that is changed and has its old time of modification put back, as rsync does, ctime is new.
+            marks = stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
+            digest.update(f"{os.path.relpath(root, folder)}/{name} {' '.join(map(str, marks))}\n".encode())
     return digest.hexdigest()[:16]
 
 

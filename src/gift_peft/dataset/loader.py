@@ -56,21 +56,20 @@ class PreparedGroups:
         self.image_names: list[list[str]] = dataset["image_names"][:]
         self.num_threads = num_threads
         self.pin = pin
-        self._cache = GroupCache(dataset, processor, size, cache_dir)
+        self.cache = GroupCache(dataset, processor, size, cache_dir)
 
     def __len__(self) -> int:
         return len(self.dataset)
 
     def __getitem__(self, index: int) -> Group:
         """Errors of `GroupCache.read`; ValueError if the row has no proxies."""
-        group = self.read(index)
+        group = self.cache.read(index)
         if group.target is None:
             raise ValueError(f"group {group.group_id} has no proxies")
-        return group
+        return self.pinned(group)
 
-    def read(self, index: int, image: int | None = None) -> Group:
-        """`GroupCache.read`: a group, or one image of it."""
-        group = self._cache.read(index, image)
+    def pinned(self, group: Group) -> Group:
+        """The same, its tensors in pinned memory if that is asked for: last, since what is made of them is not."""
         if self.pin:
             for name in ("pixel_values", "mask", "valid", "target", "surface_target"):
                 if (tensor := getattr(group, name)) is not None:
@@ -105,7 +104,7 @@ class PreparedImages:
 
         Errors of `GroupCache.read`; ValueError if the row has no surface targets.
         """
-        image = self.groups.read(*self._places[index])
+        image = self.groups.cache.read(*self._places[index])
         if image.surface_target is None:
             raise ValueError(f"group {image.group_id} has no surface targets")
         image.names = [f"{image.group_id}/{name}" for name in image.names]
@@ -117,7 +116,7 @@ class PreparedImages:
         if (unknown := image.surface_target == UNKNOWN).any():  # as with the proxies of whole groups
             image.valid = ~unknown if image.valid is None else image.valid & ~unknown
             image.surface_target = image.surface_target.masked_fill(unknown, 0)
-        return image
+        return self.groups.pinned(image)
 
     def take(self, items: Iterable[tuple[int, bool]]) -> Iterator[Group]:
         """`read` of these (index, flip), in this order; there may be infinitely many."""

@@ -117,7 +117,8 @@ def predict_video(
                 target = read_mask(Path(mask), batch[0].shape[:2])
                 state.flicker = {own: Flicker(target) for own in models}
             state.bar = state.bar or tqdm(total=total, desc="predict", unit="frame", disable=quiet)
-            state.add(batch, _predict(model, batch, models, f"{source}, frame {state.count}"))
+            names = [f"{source}, frame {state.count + index}" for index in range(len(batch))]
+            state.add(batch, _predict(model, batch, models, names))
     except KeyboardInterrupt:  # how a camera is stopped; what there is so far is kept
         if not state.count:
             raise
@@ -232,9 +233,9 @@ def _batches(frames: Iterator[np.ndarray], size: int) -> Iterator[list[np.ndarra
         yield batch
 
 
-def _predict(model: Any, frames: list[np.ndarray], models: list[str], name: str) -> dict[str, list[np.ndarray]]:
+def _predict(model: Any, frames: list[np.ndarray], models: list[str], names: list[str]) -> dict[str, list[np.ndarray]]:
     from PIL import Image
 
     pictures = [Image.fromarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) for frame in frames]
     pixels, sizes = model.inputs(pictures), [frame.shape[:2] for frame in frames]
-    return {own: model.depths_of(pixels, sizes, [name] * len(frames), base=own == "base") for own in models}
+    return {own: model.depths_of(pixels, sizes, names, base=own == "base") for own in models}

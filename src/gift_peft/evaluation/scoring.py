@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from gift_peft.dataset.shares import Alone, failing_together, in_order, own_share
 from gift_peft.evaluation.alignment import align, known, resize_prediction
 from gift_peft.evaluation.fitting import DegenerateFitError
 from gift_peft.evaluation.metrics import depth_metrics, metric_names
@@ -61,30 +62,27 @@ def score_groups(
 ) -> list[Scored]:
     """Per task (GCE per group, rows) of all groups in their order, which the processes share.
 
-    `read(index)` predicts a group and gives what each task scores of it.
+    `read(index)` predicts a group and gives what each task scores of it. A ValueError or OSError of one process, from
+    reading or scoring, is raised in all.
     """
-    rank, world = (accelerator.process_index, accelerator.num_processes) if accelerator else (0, 1)
-    mine = range(rank, count, world)
+    state = accelerator or Alone()
+    mine = own_share(count, state)
     results: list[list[tuple[dict, list[dict]]]] = []
     waiting: deque[Future] = deque()
     pool = ThreadPoolExecutor(SCORERS, thread_name_prefix="scoring")
-    quiet = None if progress and rank == 0 else True
-    try:
-        for index in tqdm(mine, desc="evaluate", unit=unit, disable=quiet):
-            samples = read(index)
-            if len(waiting) == SCORERS:
-                results.append(waiting.popleft().result())
-            waiting.append(pool.submit(_score_all, samples, tasks))
-        results += [future.result() for future in waiting]
-    finally:
-        pool.shutdown(cancel_futures=True)
-    found = list(zip(mine, results, strict=True))
-    if world > 1:
-        from accelerate.utils import gather_object
-
-        found = gather_object(found)
-    found.sort(key=lambda pair: pair[0])
-    by_task = list(zip(*(result for _, result in found), strict=True)) or [()] * len(tasks)
+    quiet = None if progress and state.process_index == 0 else True
+    with failing_together(state):
+        try:
+            for index in tqdm(mine, desc="evaluate", unit=unit, disable=quiet):
+                samples = read(index)
+                if len(waiting) == SCORERS:
+                    results.append(waiting.popleft().result())
+                waiting.append(pool.submit(_score_all, samples, tasks))
+            results += [future.result() for future in waiting]
+        finally:
+            pool.shutdown(cancel_futures=True)
+    found = in_order(list(zip(mine, results, strict=True)), state)
+    by_task = list(zip(*found, strict=True)) or [()] * len(tasks)
     return [([group for group, _ in own], [row for _, rows in own for row in rows]) for own in by_task]
 
 

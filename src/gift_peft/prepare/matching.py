@@ -47,14 +47,14 @@ class Frame:
         image: np.ndarray,
         target: np.ndarray | None,
         settings: RegistrationSettings,
-        seen: "Frame | None" = None,
+        seen: Picture | None = None,
     ):
         """`image` (H, W, 3) RGB uint8, `target` (H, W) bool or None where there is none.
 
-        `seen` is a frame of the same picture and settings, with whatever target: its features are this one's.
+        `seen` is the `picture` of a frame of the same image and settings, with whatever target.
         """
-        self._picture = Picture(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), settings) if seen is None else seen._picture
-        self.gray = self._picture.gray
+        self.picture = seen or Picture(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), settings)
+        self.gray = self.picture.gray
         self.target = np.zeros(self.gray.shape, bool) if target is None else target
         self.settings = settings
 
@@ -83,7 +83,7 @@ class Frame:
 
     def features(self, contrast: float, outside_only: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """(K, 2) points, (K, 128) float32 descriptors of at least this contrast; the strongest where they are many."""
-        points, descriptors, contrasts = self._picture.features
+        points, descriptors, contrasts = self.picture.features
         chosen = contrasts >= contrast
         if outside_only:
             column, row = np.clip(np.round(points).astype(int), 0, np.array(self.size) - 1).T

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from gift_peft.prepare.entries import FrameEntry, Remark
-from gift_peft.prepare.matching import Frame
+from gift_peft.prepare.matching import Frame, Picture
 from gift_peft.prepare.quality import SmallFrame
 from gift_peft.prepare.registration import Registration, valid_area, warp
 from gift_peft.prepare.settings import RegistrationSettings
@@ -42,7 +42,7 @@ class Photo:
     pixels: np.ndarray
     mask: np.ndarray | None
     matrix: np.ndarray | None = None
-    _seen: Frame | None = field(default=None, init=False, repr=False)
+    _seen: Picture | None = field(default=None, init=False, repr=False)
 
     @property
     def dropped(self) -> bool:
@@ -69,7 +69,7 @@ class Photo:
     def frame(self, target: np.ndarray | None, settings: RegistrationSettings, again: bool) -> Frame:
         """As registration sees it, with a `target` (H, W) bool; `again`: it will be registered once more."""
         frame = Frame(self.pixels, target, settings, self._seen)
-        self._seen = frame if again else None
+        self._seen = frame.picture if again else None  # not the frame: it holds 8 bytes more per pixel
         return frame
 
     def decide(self, result: Registration) -> None:

@@ -24,10 +24,10 @@ from tqdm import tqdm
 
 from gift_peft.adapters.folder import ADAPTER_FILES, ADAPTER_WEIGHTS
 from gift_peft.dataset.digests import DigestCache, default_digests_dir, fingerprint
+from gift_peft.dataset.shares import failing_together, in_order, own_share
 from gift_peft.files import jsonable, reason, remove_folder, strangers, whole_folder, write_whole
 from gift_peft.models.identity import FILES, earlier_revision, teacher_revision
 from gift_peft.training.arguments import FREE_TO_CHANGE, LENGTH, GiftTrainingArguments
-from gift_peft.training.shares import failing_together, in_order, own_share
 
 BEST = "best"
 CHECKSUMS = "checksums.json"

@@ -15,6 +15,7 @@ from accelerate import Accelerator
 from tqdm import tqdm
 
 from gift_peft.dataset.loader import PreparedGroups, PreparedImages, epoch_flips, epoch_order, read_ahead
+from gift_peft.dataset.shares import failing_together, in_order, own_share
 from gift_peft.dataset.tensors import Group
 from gift_peft.group_inputs import GroupInputs
 from gift_peft.group_step import GroupStep
@@ -22,7 +23,6 @@ from gift_peft.losses import gift_terms, masked_l1
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.mask_checks import check_surroundings, warn_of_masks
 from gift_peft.training.schedule import updates_after
-from gift_peft.training.shares import failing_together, in_order, own_share
 from gift_peft.training.speed import checkpoint_blocks
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 

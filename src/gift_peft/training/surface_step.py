@@ -178,9 +178,8 @@ class SurfaceStep:
         gradients = [p.grad for p in parameters if p.grad is not None]
         norm = torch.nn.utils.get_total_norm(gradients, math.inf)
         facts = torch.cat([means, norm.to(means)[None], *self._flat(finite)])
-        consistency, distillation, _, norm, *flags = (
-            facts.tolist()
-        )  # the one place where the host waits for the device
+        # Here the host waits for the device: the only time, where no other process has to agree.
+        consistency, distillation, _, norm, *flags = facts.tolist()
         self._check_finite(flags, names)
         total = self.lambda_c * consistency + self.lambda_d * distillation
         if not math.isfinite(total):  # differences of finite predictions overflow

@@ -36,13 +36,13 @@ from gift_peft.dataset.proxies import (
     write_proxies,
     write_surface,
 )
+from gift_peft.dataset.shares import failing_together, own_share
 from gift_peft.evaluation.surface_check import describe, describe_nothing, surface_lines
 from gift_peft.models.identity import earlier_revision, teacher_id, teacher_revision
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.pixels import pixel_settings, resize_mask
 from gift_peft.rules import UNKNOWN, GroupPictures
 from gift_peft.surface_targets import SurfaceTarget, paint_fills, surface_target
-from gift_peft.training.shares import failing_together, own_share
 
 if TYPE_CHECKING:
     from accelerate import Accelerator

@@ -2,15 +2,22 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from accelerate.utils import gather_object
 
 Item = TypeVar("Item")
 
 
+class Alone(NamedTuple):
+    """The state of a process that does all of the work, whatever others do."""
+
+    process_index: int = 0
+    num_processes: int = 1
+
+
 def own_share(count: int, state: Any) -> range:
-    """Which of so many groups are this process's; `state` is an `Accelerator` or a `PartialState`."""
+    """Which of so many groups are this process's; `state` is an `Accelerator`, a `PartialState` or `Alone`."""
     return range(state.process_index, count, state.num_processes)
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import socket
+from urllib.request import proxy_bypass_environment
 
 import pytest
 
@@ -124,10 +125,18 @@ def test_gradio_is_named_where_it_is_missing(monkeypatch):
 
 
 def test_the_private_folder_goes_and_gradio_tells_nobody(monkeypatch):
-    for name in ("GRADIO_TEMP_DIR", "GRADIO_ANALYTICS_ENABLED"):
+    for name in ("GRADIO_TEMP_DIR", "GRADIO_ANALYTICS_ENABLED", "NO_PROXY", "no_proxy"):
         monkeypatch.setenv(name, "before")  # put back after the test
     with private_folder() as folder:
         assert os.environ["GRADIO_TEMP_DIR"].startswith(str(folder))
         assert os.environ["GRADIO_ANALYTICS_ENABLED"] == "False"
+        assert proxy_bypass_environment("127.0.0.1:7860") and proxy_bypass_environment("before")
         (folder / "gradio").mkdir()
     assert not folder.exists()
+
+
+def test_browsers_leave_out_the_port_80(monkeypatch):
+    assert answer("/", {"host": "127.0.0.1"})[0] == 403
+    monkeypatch.setitem(globals(), "PORT", 80)
+    assert answer("/", {"host": "127.0.0.1", "origin": "http://127.0.0.1"})[0] == 200
+    assert answer("/", {"host": "evil.example"})[0] == 403

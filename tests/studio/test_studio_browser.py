@@ -317,7 +317,7 @@ window.element = document;
 window.saves = [];
 window.waiting = [];
 const uri = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7";
-const state = (group, photo) => ({ there: false, place: `${group}/${photo || ""}`, version: "0", problem: null, overlay: uri });
+const state = (group, photo = "") => ({ place: `${group}/${photo}`, version: "0", overlay: uri });
 const later = (answer) => new Promise((resolve) => window.waiting.push(() => resolve(answer)));
 window.server = {
   groups: async () => ({ groups: ["a", "b"].map((name) => ({ name, state: "", done: false })) }),

@@ -96,10 +96,8 @@ class Guard:
 
     def __init__(self, app: Any, port: int, folder: Path) -> None:
         self.app, self.folder = app, Path(os.path.realpath(folder))
-        names = (HOST, "localhost")
-        self.hosts = {f"{name}:{port}" for name in names} | (
-            {*names} if port == 80 else set()
-        )  # browsers leave :80 out
+        # Browsers leave :80 out.
+        self.hosts = {f"{name}:{port}".removesuffix(":80") for name in (HOST, "localhost")}
 
     async def __call__(self, scope: dict, receive: Any, send: Any) -> None:
         if scope["type"] == "lifespan":

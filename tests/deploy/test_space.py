@@ -55,7 +55,7 @@ def test_a_scene_is_the_surface_and_no_wall(tmp_path):
     points, colors, triangles = (binary[start : start + length] for start, length in views)
     points = np.frombuffer(points, "<f4").reshape(-1, 3)
     triangles = np.frombuffer(triangles, "<u4").reshape(-1, 3)
-    assert np.frombuffer(colors, np.uint8).reshape(-1, 4)[0].tolist() == [200, 10, 30, 255]
+    assert np.frombuffer(colors, np.uint8).reshape(-1, 4)[0].tolist() == [147, 1, 3, 255]  # (200, 10, 30) as light
     assert len(triangles) == 2 * 59 * (79 - 1)  # one column of squares lies on the step
     depths = -(points[:, 2] - 1)
     assert np.ptp(depths[triangles], axis=1).max() < 0.1

@@ -45,11 +45,17 @@ def to_points(
 
 
 def encode_points(points: np.ndarray, colors: np.ndarray, form: str) -> bytes:
-    """A file of points: `ply` with the axes of a camera (x right, y down, z away), `glb` with those of glTF (y up)."""
+    """A file of points: `ply` with the axes of a camera (x right, y down, z away), `glb` with those of glTF (y up).
+
+    The colors of a ply are those of the picture; glTF wants them as amounts of light (linear RGB).
+    """
     import trimesh
 
     if form == "glb":
         points = points * np.float32([1, -1, -1])
+        share = colors / 255
+        light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # sRGB, IEC 61966-2-1
+        colors = np.round(255 * light).astype(np.uint8)
     cloud = trimesh.PointCloud(points, np.c_[colors, np.full(len(colors), 255, np.uint8)])
     content = io.BytesIO()
     cloud.export(content, file_type=form)

@@ -53,7 +53,8 @@ def write_scene(path: Path, picture: Image.Image, z: np.ndarray, field_of_view: 
     Where neighbors are far apart in depth there is a hole, not a wall.
     """
     step = max(1, -(-max(z.shape) // MESH_SIDE))
-    z, colors = z[::step, ::step].astype(np.float32), np.asarray(picture)[::step, ::step]
+    z, shown = z[::step, ::step].astype(np.float32), np.asarray(picture)[::step, ::step] / 255
+    light = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # glTF wants linear RGB
     height, width = z.shape
     focal = width / 2 / np.tan(np.radians(field_of_view) / 2)
     rows, columns = np.mgrid[:height, :width]
@@ -66,7 +67,7 @@ def write_scene(path: Path, picture: Image.Image, z: np.ndarray, field_of_view: 
     whole = (depths.max(-1) - depths.min(-1)) < EDGE * depths.min(-1)
     quads = corners[whole]
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype("<u4")
-    paint = np.concatenate([colors.reshape(-1, 3), np.full((height * width, 1), 255)], axis=1).astype(np.uint8)
+    paint = np.round(255 * np.c_[light.reshape(-1, 3), np.ones(height * width)]).astype(np.uint8)
     path.write_bytes(_glb(points, paint, triangles))
 
 

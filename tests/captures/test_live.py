@@ -80,3 +80,14 @@ def test_leaving_early_ends_the_reading(address):
 def test_what_is_not_there_is_named(device, message):
     with pytest.raises(ValueError, match=message):
         next(live_frames(device))
+
+
+@pytest.mark.parametrize("frame", [np.zeros(SIZE, np.uint8), np.zeros((*SIZE, 3), np.uint16)])
+def test_cameras_without_color_are_named(frame, monkeypatch):
+    class Camera:
+        read = staticmethod(lambda: (True, frame))
+        release = staticmethod(lambda: None)
+
+    monkeypatch.setattr(live, "_open", lambda *_: Camera)
+    with pytest.raises(ValueError, match=r"^camera 0: frames of .*8-bit color"):
+        next(live_frames(0))

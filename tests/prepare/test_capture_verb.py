@@ -174,3 +174,44 @@ def test_ctrl_c_keeps_what_was_taken(tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().out
     assert "stopped" in said and "too few for a group" in said
     assert [path.name for path in (tmp_path / "raw/group_1").iterdir()] == ["001.png"]
+
+
+def test_frames_of_another_size_end_it_and_photos_stay(tmp_path):
+    made, session = Making(SIZE), Session(tmp_path / "raw", "door", None, 12, None, asks=True)
+    made.hold(views(6, SIZE, 1)[0][0], 1.5)
+    for index, frame in enumerate(made.frames):
+        session.see(ClipFrame(index, index / 15, frame))
+    said = session.see(ClipFrame(99, 9.0, made.frames[0][:-1, :-2]))
+    assert session.ended and "the frames are 318x239 now, and were 320x240" in said[0]
+    assert "1 photo" in session.finish("0")[0]
+
+
+def test_a_reference_before_any_photo_leaves_nothing(tmp_path, capsys):
+    clip = still_clip(tmp_path / "a.mp4", views(4, SIZE, 1)[0])
+    assert capture(clip, tmp_path / "raw", "--reference-at", "00:00") == 1
+    assert "--reference-at: no photo was taken in" in capsys.readouterr().err
+    assert not (tmp_path / "raw").exists()
+
+
+def test_q_after_r_ends_without_a_reference(tmp_path):
+    made, session = Making(SIZE), Session(tmp_path / "raw", "door", None, 12, None, asks=True)
+    made.hold(views(6, SIZE, 1)[0][0], 1.5)
+    for index, frame in enumerate(made.frames):
+        session.see(ClipFrame(index, index / 15, frame), {len(made.frames) - 1: "r"}.get(index))
+    session.see(ClipFrame(99, 9.0, made.frames[0]), "q")
+    told = session.finish("0")
+    assert session.ended and "1 photo" in told[0] and "asked for and not taken" in "".join(told)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["99999999999"], "99999999999: neither a camera's number"),
+        (["a.mp4", "--reference-at", "b.mp4 00:42"], "--reference-at b.mp4 00:42: the time alone, as 00:42"),
+    ],
+)
+def test_numbers_and_times_that_mean_nothing_are_one_line(tmp_path, capsys, words, message):
+    source, *options = words
+    assert capture(source, tmp_path / "raw", *options) == 1
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1 and message in said[0]

@@ -157,3 +157,35 @@ def test_a_person_may_ask_for_a_photo_and_for_the_reference():
 def test_a_mask_of_another_size_is_named():
     with pytest.raises(ValueError, match="the mask is 10x10, and the frames are 320x240"):
         Coach(np.ones((10, 10), bool)).see(0, 0.0, np.zeros((*SIZE, 3), np.uint8))
+
+
+def test_a_target_that_fills_the_picture_says_nothing_of_the_camera():
+    made = Making(SIZE)
+    for seed in (3, 4):
+        made.hold(views(seed, SIZE, 1)[0][0], 1.5)
+    spoken = watch(made, np.ones(SIZE, bool))
+    assert len(photos(spoken, made.holds)) == 2 and not set().union(*map(codes, spoken))
+
+
+def test_no_group_begins_where_the_target_is_out_of_the_picture():
+    pictures, mask = views(3, SIZE, 1)[0], np.zeros(SIZE, bool)
+    mask[80:200, :6] = True
+    made = Making(SIZE)
+    for push in (0, -12):
+        made.hold(pushed(pictures[0], push), 3.5)
+    spoken = watch(made, mask)
+    assert "moved" in codes(spoken[-1]) and not any(advice.new_group for advice in spoken)
+    assert np.isfinite([advice.changed for advice in spoken]).all()
+
+
+def test_a_reference_of_another_pose_begins_no_group():
+    picture, made = views(3, SIZE, 1)[0][0], Making(SIZE)
+    for push in (0, 5):
+        made.hold(pushed(picture, push), 3.5)
+    coach, spoken = Coach(), []
+    for index, frame in enumerate(made.frames):
+        if index == made.holds[1][0]:
+            coach.ask_reference()
+        spoken.append(coach.see(index, index / RATE, frame[..., ::-1].copy()))
+    assert "moved" in codes(spoken[-1])
+    assert not any(advice.new_group or advice.is_reference for advice in spoken)

@@ -127,6 +127,7 @@ def test_sam_redraws_what_was_clicked_on(monkeypatch):
         [{"tool": "click", "x": "0.5", "y": 0.5, "target": True}],
         [{"tool": "click", "x": float("nan"), "y": 0.5, "target": True}],
         [{"tool": "click", "x": float("inf"), "y": 0.5, "target": True}],
+        [{"tool": "click", "x": 10**400, "y": 0.5, "target": True}],
         [{"tool": "click", "x": 0.5, "y": 0.5}],
         [{"tool": "click", "x": True, "y": 0.5, "target": True}],
         [{**STROKE, "points": []}],

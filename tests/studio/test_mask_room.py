@@ -14,6 +14,7 @@ from PIL import Image
 
 from gift_peft.captures.tree import decode_capture, read_capture
 from gift_peft.prepare.prepare import prepare_gift_i
+from gift_peft.studio import mask_room
 from gift_peft.studio.mask_room import MaskRoom
 
 SIZE = 180, 240
@@ -265,3 +266,32 @@ def test_progress_is_told_while_a_group_is_opened(room, monkeypatch):
     goes.set()
     opening.join()
     assert room.progress({"group": "train/hall"}) == {"said": ""}
+
+
+def test_a_group_that_goes_while_groups_are_listed_is_a_line(copy, monkeypatch):
+    room, _ = copy
+    shutil.copytree(room.root / "hall", room.root / "later")
+    found = mask_room.find_clip_group
+
+    def lose(folder, root):
+        shutil.rmtree(room.root / "later", ignore_errors=True)
+        return found(folder, root)
+
+    monkeypatch.setattr(mask_room, "find_clip_group", lose)
+    assert [group["name"] for group in room.groups()["groups"]] == ["train/hall", "train/later"]
+
+
+def test_a_reference_of_another_size_is_named(tmp_path):
+    folder = tmp_path / "raw" / "hall"
+    folder.mkdir(parents=True)
+    for name, size in (("1.png", (60, 40)), ("reference.png", (50, 40))):
+        Image.new("RGB", size, (90, 120, 30)).save(folder / name)
+    with pytest.raises(ValueError, match=r"reference\.png: 50x40, and the photos are 60x40"):
+        MaskRoom(tmp_path / "raw", tmp_path / "own").open({"group": "validation/hall"})
+
+
+def test_unsaved_edits_of_one_folder_are_not_those_of_another(copy, opened):
+    """The page keeps them by the place of the mask, and groups of two folders may have one name."""
+    about = {"group": "train/hall"}
+    place, photo = (copy[0].start({**about, **more})["place"] for more in ({}, {"photo": "0.png"}))
+    assert len({place, photo, opened[0].start(about)["place"]}) == 3

@@ -3,11 +3,15 @@
 import asyncio
 import os
 import socket
+from types import SimpleNamespace
+from urllib.request import proxy_bypass_environment
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from gift_peft.studio import server
-from gift_peft.studio.server import Guard, check_gradio, free_port, private_folder
+from gift_peft.studio.server import Guard, Rooms, build, check_gradio, free_port, private_folder
 
 PORT = 7860
 OWN = {"host": f"127.0.0.1:{PORT}"}
@@ -124,10 +128,29 @@ def test_gradio_is_named_where_it_is_missing(monkeypatch):
 
 
 def test_the_private_folder_goes_and_gradio_tells_nobody(monkeypatch):
-    for name in ("GRADIO_TEMP_DIR", "GRADIO_ANALYTICS_ENABLED"):
+    for name in ("GRADIO_TEMP_DIR", "GRADIO_ANALYTICS_ENABLED", "NO_PROXY", "no_proxy"):
         monkeypatch.setenv(name, "before")  # put back after the test
     with private_folder() as folder:
         assert os.environ["GRADIO_TEMP_DIR"].startswith(str(folder))
         assert os.environ["GRADIO_ANALYTICS_ENABLED"] == "False"
+        assert proxy_bypass_environment("127.0.0.1:7860") and proxy_bypass_environment("before")
         (folder / "gradio").mkdir()
     assert not folder.exists()
+
+
+def test_browsers_leave_out_the_port_80(monkeypatch):
+    assert answer("/", {"host": "127.0.0.1"})[0] == 403
+    monkeypatch.setitem(globals(), "PORT", 80)
+    assert answer("/", {"host": "127.0.0.1", "origin": "http://127.0.0.1"})[0] == 200
+    assert answer("/", {"host": "evil.example"})[0] == 403
+
+
+def test_photos_reach_the_room_as_their_files_are(tmp_path):
+    """Converted by the page, a deep one would come white, and with another idea of transparency."""
+    gr = pytest.importorskip("gradio")
+    image_data = pytest.importorskip("gradio.data_classes").ImageData
+    room = SimpleNamespace(model=SimpleNamespace(adapted=True))
+    photos = [one for one in build(Rooms(compare=room), "a").blocks.values() if isinstance(one, gr.Image)]
+    Image.fromarray(np.full((4, 5), 3000, np.uint16)).save(tmp_path / "deep.png")
+    given = image_data(path=str(tmp_path / "deep.png"), orig_name="deep.png")
+    assert [photo.preprocess(given) for photo in photos] == [given.path]

@@ -27,6 +27,7 @@ from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.prepare.prepare import prepare_gift_i
 from gift_peft.prepare.settings import PrepareSettings
 from gift_peft.studio.group_view import look_at
+from gift_peft.studio.server import PAGE
 from gift_peft.training.teacher import make_proxies
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -309,3 +310,77 @@ def test_targets_and_comparison(browser, tmp_path, fresh_cache):
             tab.page.locator("#points canvas").wait_for()
             assert tab.page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
             tab.close()
+
+
+FAKE = """
+window.element = document;
+window.saves = [];
+window.waiting = [];
+const uri = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7";
+const state = (group, photo = "") => ({ place: `${group}/${photo}`, version: "0", overlay: uri });
+const later = (answer) => new Promise((resolve) => window.waiting.push(() => resolve(answer)));
+window.server = {
+  groups: async () => ({ groups: ["a", "b"].map((name) => ({ name, state: "", done: false })) }),
+  progress: async () => ({ said: "" }),
+  open: async ({ group }) => ({ ...state(group), name: group, size: [40, 30], verdict: [], compares: true, heat: uri,
+    photos: [{ name: "1.png", says: "", texts: [], status: "kept", picture: uri, own: false }] }),
+  photo: async () => ({ picture: uri }),
+  start: ({ group, photo }) => window.slow ? later(state(group, photo)) : Promise.resolve(state(group, photo)),
+  draw: async ({ edits }) => ({ overlay: uri, area: edits.length / 100, still: false }),
+  save: (request) => { window.saves.push(request); return later({ saved: "mask.png", version: "1" }); },
+};
+"""
+
+
+@pytest.fixture
+def room_page(browser):
+    """The Masks room's page alone, before a server that answers a save when it is told to."""
+    html, code = ((PAGE / f"mask_editor.{kind}").read_text(encoding="utf-8") for kind in ("html", "js"))
+    page = browser.new_page()
+    page.route("http://room.test/", lambda route: route.fulfill(body=f"<body>{html}</body>", content_type="text/html"))
+    page.add_init_script("addEventListener('DOMContentLoaded', () => {" + FAKE + code + ";window.room = room;})")
+    page.goto("http://room.test/")
+    page.wait_for_function("window.room && room.view")
+    yield page
+    page.close()
+
+
+def test_what_is_drawn_while_a_mask_is_saved_is_kept(room_page):
+    page = room_page
+    for key in ("p", "s", "s", "x"):  # a second save while the first is on its way would be a conflict with oneself
+        page.locator("canvas").press(key)
+    assert page.evaluate("saves.length") == 1
+    page.evaluate("waiting.shift()()")
+    page.wait_for_function("room.version === '1'")
+    assert page.evaluate("room.edits.map((one) => one.tool)") == ["clear"]
+    page.reload()
+    page.wait_for_function("window.room && room.edits.length")
+    assert page.evaluate("room.edits.map((one) => one.tool)") == ["clear"]
+    assert "The mask was changed meanwhile" in page.locator(".said").text_content()
+
+
+def test_a_save_that_ends_after_another_group_was_opened_leaves_that_alone(room_page):
+    page = room_page
+    for key in ("p", "s"):
+        page.locator("canvas").press(key)
+    page.locator(".group").select_option("b")
+    page.wait_for_function("room.place === 'b/'")
+    page.locator("canvas").press("x")
+    page.evaluate("waiting.shift()()")
+    page.wait_for_function("document.querySelector('.said').textContent.startsWith('Saved')")
+    assert page.evaluate("[room.group, room.version, room.edits.length]") == ["b", "0", 1]
+    assert page.evaluate("[sessionStorage.getItem('studio a/'), sessionStorage.getItem('studio b/') !== null]") == [
+        None,
+        True,
+    ]
+
+
+def test_the_last_of_two_choices_counts_whichever_answer_comes_first(room_page):
+    page = room_page
+    page.evaluate("window.slow = true")
+    page.locator(".for").select_option("1.png")
+    page.locator(".for").select_option("")
+    page.evaluate("waiting.reverse().forEach((answer) => answer())")
+    page.wait_for_function("document.querySelector('.said').textContent.includes('all photos')")
+    page.wait_for_timeout(100)
+    assert page.evaluate("[room.own, room.place]") == ["", "a/"]

@@ -84,7 +84,8 @@ class Clip:
                     there, pixels = capture.retrieve()
                     if not there:
                         break
-                    yield ClipFrame(index, seconds, self._checked(pixels))
+                    check_frame(pixels, self.path)
+                    yield ClipFrame(index, seconds, pixels)
                     if left is not None:
                         left.discard(index)
                 index += 1
@@ -109,14 +110,13 @@ class Clip:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)  # phones store upright clips lying, with a rotation beside them
         return capture
 
-    def _checked(self, pixels: np.ndarray) -> np.ndarray:
-        if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
-            raise ValueError(f"{self.path}: frames of {pixels.shape} {pixels.dtype}; it takes 8-bit color")
-        if max(pixels.shape) > MAX_SIDE:
-            raise ValueError(
-                f"{self.path}: frames of {pixels.shape[1]}x{pixels.shape[0]}; a side is at most {MAX_SIDE}"
-            )
-        return pixels
+
+def check_frame(pixels: np.ndarray, source: str | Path) -> None:
+    """Raise ValueError, naming the source, unless it is (H, W, 3) uint8 and not too large to be warped."""
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise ValueError(f"{source}: frames of {pixels.shape} {pixels.dtype}; it takes 8-bit color")
+    if max(pixels.shape) > MAX_SIDE:
+        raise ValueError(f"{source}: frames of {pixels.shape[1]}x{pixels.shape[0]}; a side is at most {MAX_SIDE}")
 
 
 def open_quietly(source: str) -> "cv2.VideoCapture":

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gift_peft.captures.clip import ClipFrame, open_quietly
+from gift_peft.captures.clip import ClipFrame, check_frame, open_quietly
 
 if TYPE_CHECKING:
     import cv2
@@ -23,7 +23,7 @@ def live_frames(device: int | str) -> Generator[ClipFrame, None, None]:
     """The newest frames of a camera (its number) or a stream (its address), with seconds since the first; ends where
     no more come.
 
-    Raises ValueError: it cannot be opened, or gives no picture at all.
+    Raises ValueError: it cannot be opened, gives no picture at all, or none in 8-bit color.
     """
     called = f"camera {device}" if isinstance(device, int) else device
     reader = _Reader(_open(device, called))
@@ -33,6 +33,7 @@ def live_frames(device: int | str) -> Generator[ClipFrame, None, None]:
         while (found := reader.newest(FIRST_PICTURE if start is None else SILENCE)) is not None:
             at, pixels = found
             start = at if start is None else start
+            check_frame(pixels, called)
             yield ClipFrame(count, at - start, pixels)
             count += 1
     finally:

@@ -35,7 +35,7 @@ class Source:
 
 def open_source(text: str) -> Source:
     """The source of this name; FileNotFoundError or ValueError if it is none, or a clip that cannot be opened."""
-    if text.isdecimal() and not Path(text).exists():
+    if text.isdecimal() and len(text) < 10 and not Path(text).exists():  # OpenCV numbers devices by 32 bits
         return Source(text, device=int(text))
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", text):
         return Source(text, device=text)
@@ -94,7 +94,8 @@ class Session:
         self.references: list[Path] = []
         self.ended = False
         self.frames, self.seconds = 0, 0.0
-        self._said_enough = False
+        self.size: tuple[int, int] | None = None  # (height, width) of the frames
+        self._reference_due = self._said_enough = False
         self._said: frozenset[str] = frozenset()
 
     @property
@@ -122,16 +123,30 @@ class Session:
         Raises OSError if the photo cannot be written, ValueError if frame and mask are not of one size.
         """
         said = self._listen(typed)
+        if self.ended:
+            return []
         self.frames, self.seconds = self.frames + 1, frame.seconds
-        if self.reference_at is not None and frame.seconds >= self.reference_at:
-            self.reference_at = None
+        size = frame.pixels.shape[:2]
+        if self.size not in (None, size):
+            self.ended = True
+            (height, width), (old_height, old_width) = size, self.size
+            text = f"the frames are {width}x{height} now, and were {old_width}x{old_height}: nothing more is taken"
+            return [f"{frame.seconds:7.1f} s  {text}"]
+        self.size = size
+        if self.reference_at is not None and not self._reference_due and frame.seconds >= self.reference_at:
+            if self.folder not in self.photos:
+                raise ValueError(
+                    f"--reference-at: no photo was taken in {self.folder} before that time; the reference comes last, "
+                    "when the surface is treated"
+                )
+            self._reference_due = True
             self.coach.ask_reference()
         try:
             self.advice = self.coach.see(frame.index, frame.seconds, frame.pixels)
         except ValueError as error:
             raise ValueError(f"{self.mask_file}: {error}") from None
         if self.advice.new_group:
-            self.folder = self._next_folder()
+            self.folder, self._said_enough = self._next_folder(), False
             said.append(f"the camera stays where it is now: the next photos are a new group, {self.folder}")
         codes = self.advice.codes
         said += [item.text for item in self.advice.warnings if item.code not in self._said]
@@ -147,14 +162,14 @@ class Session:
     def finish(self, source: str) -> list[str]:
         """What there is now, and the command to type next.
 
-        Raises ValueError: no photo was taken, or the reference that was asked for was not.
+        Raises ValueError: no photo was taken, or not the reference of `reference_at`.
         """
         if not self.photos:
             raise ValueError(
                 f"{source}: no photo was taken in {self.seconds:.1f} s ({self.frames} frames); hold camera and scene "
                 "still for a second after each change"
             )
-        if self.reference_at is not None or self.coach.wanted == "reference":
+        if self.reference_at is not None and not self.references:
             raise ValueError(
                 f"{source}: no treated reference was taken: no still, sharp moment after the time that was asked for; "
                 f"the photos are kept in {', '.join(map(str, self.photos))}"
@@ -167,6 +182,8 @@ class Session:
             elif count == 1:
                 told += ", too few for a group: add another to the folder, or delete it"
             lines.append(told)
+        if self.coach.wanted == "reference":
+            lines.append("The treated reference was asked for and not taken.")
         if self.mask is None:
             place = next(iter(self.photos)) / "mask.png"
             lines.append(f"Draw the target in {place}, white where the glass or mirror is.")

@@ -22,7 +22,8 @@ DESCRIPTION = """Take the photos of a group: says what would spoil them, and tak
 SOURCE is a camera's number, the address of a stream (rtsp://, http://), or a clip. OUT gets a raw tree, which
 `gift-peft prepare` reads. Typed while a camera runs: Enter takes a photo of the next still moment, whatever is said of
 it; r and Enter the treated reference, last of all; q and Enter ends without one. Ctrl-C keeps what was taken.
-Exit code: 0 if photos were taken, 1 if none was or SOURCE cannot be read, 2 for a wrong command line."""
+Exit code: 0 if photos were taken, 1 if none was, if the moment of --reference-at
+gave none, or if SOURCE cannot be read, 2 for a wrong command line."""
 
 
 def make_parser() -> OptionParser:
@@ -47,15 +48,18 @@ def run(argv: Sequence[str]) -> int:
     from gift_peft.captures.clip import read_time
     from gift_peft.prepare.capture_session import Session, open_source
 
-    at = None if args.reference_at is None else read_time(args.reference_at, "--reference-at").seconds
+    at = None if args.reference_at is None else read_time(args.reference_at, "--reference-at")
+    if at is not None and at.clip is not None:
+        raise ValueError(f"--reference-at {args.reference_at}: the time alone, as 00:42; SOURCE names the clip")
     source = open_source(args.source)
     live = source.clip is None
     if at is not None and live:
         raise ValueError("--reference-at is for clips; at a camera, type r and Enter when the surface is treated")
-    session = Session(Path(args.out), args.group, args.mask, args.max_frames, at, live)
+    session = Session(Path(args.out), args.group, args.mask, args.max_frames, at and at.seconds, live)
     typed = _typed() if live and sys.stdin.isatty() else itertools.repeat(None)
     status = _Status()
     frames = source.frames()
+    status.show(f"opening {args.source}")
     try:
         for frame in frames:
             with _photo_whole():

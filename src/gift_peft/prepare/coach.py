@@ -223,6 +223,8 @@ class Coach:
         self._moved, since, self._moved_since = None, self._moved_since, None
         self._advice = replace(self._advice, drift=None if motion is None else motion.pixels)
         if motion is None:
+            if self.outside is not None and self.outside.sum() < LEAST_OUTSIDE:
+                return []  # the target fills the picture: that it shows something else says nothing of the camera
             changed = difference(cells, self.group.cells[0], self.outside) > 2 * OTHER_CONTENT
             share = float((changed if self.outside is None else changed[self.outside]).mean())
             if share <= STRUCTURE_CHANGED:
@@ -250,8 +252,9 @@ class Coach:
     def _decide(self, seconds: float, moment: Moment) -> None:
         """A photo, a new group, or a word that nothing new shows."""
         if "moved" in self._advice.codes:
-            known = self._moved is not None or self.mask is None  # else the mask cannot be carried along
-            if known and (self.wanted == "photo" or seconds - self._moved_since > TOLD_LONG_ENOUGH):
+            stays = self.wanted == "photo" or seconds - self._moved_since > TOLD_LONG_ENOUGH
+            # A reference of another pose would stand in a group without photos.
+            if stays and self.wanted != "reference" and self._can_carry_mask():
                 self._begin_group()
             return
         ready = moment.best is not None and seconds - moment.start >= QUIET
@@ -311,6 +314,12 @@ class Coach:
         self._wrong, self._nothing_new, self._since, self._moved_since = [], None, {}, None
         self._advice = Advice(still=True, new_group=True)
         self._restart()
+
+    def _can_carry_mask(self) -> bool:
+        """Whether it is known where the target is after the camera's motion, and is in the picture."""
+        if self.mask is None or self._moved is None:
+            return self.mask is None
+        return bool(warp(self.mask, self._moved.matrix @ self.matrix).any())
 
     @property
     def mask_here(self) -> np.ndarray | None:

@@ -127,7 +127,12 @@ def look_at(
     pictures, size = _pictures(capture, matrices)
     compared = [picture for picture, frame in zip(pictures, observations, strict=True) if frame["status"] != "dropped"]
     if capture.reference is not None and len(compared) < 2:
-        compared.insert(0, at_working_size(np.asarray(read_image(capture.reference))))
+        treated = np.asarray(read_image(capture.reference))
+        if treated.shape[1::-1] != size:
+            raise ValueError(
+                f"{capture.reference}: {treated.shape[1]}x{treated.shape[0]}, and the photos are {size[0]}x{size[1]}"
+            )
+        compared.insert(0, at_working_size(treated))
     change, noise = np.zeros(pictures[0].shape[:2], np.float32), 1.0
     if len(compared) > 1:
         change, noise = change_map(compared, CHANGE_SIDE)

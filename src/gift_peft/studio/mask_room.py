@@ -6,6 +6,7 @@ and a photo are looked up by name in what the folder holds, and never become a p
 
 import base64
 import io
+import os
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
@@ -51,7 +52,8 @@ class MaskRoom:
 
     def groups(self, _: Any = None) -> dict:
         """`groups`, each with `name` ("train/hall"), `state` and `done`."""
-        return {"groups": [self._state(*key) for key in self._folders()]}
+        found = self._folders().items()
+        return {"groups": [self._state(f"{split}/{group}", split, folder) for (split, group), folder in found]}
 
     def progress(self, request: dict) -> dict:
         """What is being done to open a group, in words."""
@@ -186,14 +188,15 @@ class MaskRoom:
         return photo_place(photo, view.folder, self.root, view.capture.facts.get("mask_class"))
 
     def _saved(self, name: str, view: GroupView, index: int | None) -> tuple[np.ndarray, dict]:
-        """The mask (H, W) to begin with, and `there`, `version`, `problem`. A photo without its own begins with the
-        group's, carried to where its camera sees it."""
+        """The mask (H, W) to begin with, and `there`, `place`, `version`, `problem`. A photo without its own begins
+        with the group's, carried to where its camera sees it."""
         place, mask, problem = self._place(name, view, index), None, None
         try:
             mask = place.read(view.size)
         except (ValueError, OSError) as error:
             problem = str(error)
-        state = {"there": mask is not None or problem is not None, "version": place.version, "problem": problem}
+        there = mask is not None or problem is not None
+        state = {"there": there, "place": os.path.abspath(place.path), "version": place.version, "problem": problem}
         if mask is None and index is not None:
             mask = view.carried(self._saved(name, view, None)[0], index)
         return np.zeros(view.size[::-1], bool) if mask is None else mask, state
@@ -202,10 +205,8 @@ class MaskRoom:
         with self._drawing:
             return draw_edits(self._saved(name, view, index)[0], edits, view.view(index))
 
-    def _state(self, split: str, group: str) -> dict:
+    def _state(self, name: str, split: str, folder: Path) -> dict:
         """How far the masks of a group are, from its files alone."""
-        folder = self._folders()[split, group]
-        name = f"{split}/{group}"
         try:
             clip = find_clip_group(checked(folder, self.root), self.root)
             if clip is not None:

@@ -86,6 +86,8 @@ def private_folder() -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="gift-peft-studio-") as folder:
         os.environ["GRADIO_TEMP_DIR"] = str(Path(folder) / "gradio")
         os.environ["GRADIO_ANALYTICS_ENABLED"] = "False"
+        for name in ("no_proxy", "NO_PROXY"):  # gradio asks its own server whether it is up, which no proxy can reach
+            os.environ[name] = ",".join(filter(None, (os.environ.get(name), HOST)))
         yield Path(folder)
 
 
@@ -94,7 +96,8 @@ class Guard:
 
     def __init__(self, app: Any, port: int, folder: Path) -> None:
         self.app, self.folder = app, Path(os.path.realpath(folder))
-        self.hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+        # Browsers leave :80 out.
+        self.hosts = {f"{name}:{port}".removesuffix(":80") for name in (HOST, "localhost")}
 
     async def __call__(self, scope: dict, receive: Any, send: Any) -> None:
         if scope["type"] == "lifespan":
@@ -276,7 +279,12 @@ def _compare_tab(gr: Any, room: "CompareRoom", _: Any) -> None:
     with gr.Row():
         with gr.Column():
             photo = gr.Image(
-                type="filepath", label="Photo", elem_id="photo", height=340, sources=["upload", "clipboard"]
+                type="filepath",
+                image_mode=None,  # the file as it is: `read_image` turns and converts it, or says why not
+                label="Photo",
+                elem_id="photo",
+                height=340,
+                sources=["upload", "clipboard"],
             )
             scale = gr.Slider(
                 0, 1, 1, step=0.05, label="Adapter scale: 0 is the base", elem_id="scale", visible=adapted

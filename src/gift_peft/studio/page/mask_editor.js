@@ -2,8 +2,8 @@
 // what comes back. `element` is this room, `server` its Python functions.
 const $ = (selector) => element.querySelector(selector);
 const canvas = $("canvas"), pen = canvas.getContext("2d"), brush = $(".brush");
-const room = { group: "", view: null, photo: "", own: "", version: "", edits: [], tool: "hit", corners: [], stroke: null,
-  cross: [0.5, 0.5], crossing: false, zoom: 1, shown: { heat: false, mask: true, blink: false }, pictures: {}, asked: 0 };
+const room = { group: "", view: null, photo: "", own: "", place: "", version: "", edits: [], tool: "hit", corners: [], stroke: null,
+  cross: [0.5, 0.5], crossing: false, zoom: 1, saving: false, shown: { heat: false, mask: true, blink: false }, pictures: {}, asked: 0 };
 
 function say(text, wrong = false) {
   $(".said").textContent = text;
@@ -22,28 +22,32 @@ async function ask(name, more = {}) {
 }
 
 const about = (photo = room.own) => (photo ? { photo } : {});
-const stored = () => `studio ${room.group} ${room.own}`;
+const stored = () => `studio ${room.place}`;  // a file: other folders have groups of the same names
+const here = ({ group, own }) => group === room.group && own === room.own;
 
 function keep() {  // unsaved edits outlive a reload of this tab
   sessionStorage.setItem(stored(), JSON.stringify({ version: room.version, edits: room.edits }));
 }
 
 function take(state) {  // a saved mask to begin with, and what this tab had drawn on it
+  room.place = state.place;
   const before = JSON.parse(sessionStorage.getItem(stored()) || "{}");
   room.version = state.version;
-  room.edits = before.version === state.version ? before.edits : [];
+  room.edits = before.edits || [];
   room.corners = [];
+  $(".conflict").hidden = true;
+  const other = before.version === state.version ? "" : " The mask was changed meanwhile: yours is added to it, and Undo takes that back.";
   $(".overlay").src = state.overlay;
   if (state.problem) say(state.problem, true);
-  return room.edits.length ? draw() : undefined;
+  return room.edits.length ? draw(other) : undefined;
 }
 
 // ---- groups and photos ----
 
-async function list(chosen) {
+async function list() {
   const { groups = [] } = await ask("groups");
   $(".group").replaceChildren(...groups.map((one) => new Option(`${one.done ? "✓" : "○"} ${one.name}: ${one.state}`, one.name)));
-  const first = groups.find((one) => one.name === chosen) || groups.find((one) => !one.done) || groups[0];
+  const first = groups.find((one) => one.name === room.group) || groups.find((one) => !one.done) || groups[0];
   if (first) $(".group").value = first.name;
   return first && first.name;
 }
@@ -124,11 +128,12 @@ async function show() {
 }
 
 async function choose(own) {  // what the mask is for: all photos, or one
+  if (!room.view) return;
   room.own = own;
   $(".for").value = own;
   if (own) room.photo = own;
-  const answer = await ask("start", about());
-  if (answer.error) return;
+  const at = { group: room.group, own }, answer = await ask("start", about());
+  if (answer.error || !here(at)) return;
   say(own ? `This mask is for ${own} alone; the photo is shown as it was taken.` : "This mask is for all photos.");
   await take(answer);
   strip();
@@ -137,14 +142,14 @@ async function choose(own) {  // what the mask is for: all photos, or one
 
 // ---- edits ----
 
-async function draw() {
+async function draw(more = "") {
   keep();
   const { group, own } = room, asked = ++room.asked;
   const answer = await ask("draw", { edits: room.edits, ...about() });
-  if (asked !== room.asked || answer.error || group !== room.group || own !== room.own) return;
+  if (asked !== room.asked || answer.error || !here({ group, own })) return;
   $(".overlay").src = answer.overlay;
   const doubt = answer.still ? " Hardly anything changes there: is it the mirror or glass? The heat map (H) shows what changes." : "";
-  say(`${(100 * answer.area).toFixed(1)} % of the photo, not saved yet.${doubt}`);
+  say(`${(100 * answer.area).toFixed(1)} % of the photo, not saved yet.${doubt}${more}`);
   strip();
 }
 
@@ -171,9 +176,18 @@ function press([x, y], shift) {
 }
 
 async function save(version = room.version) {
-  if (!room.view) return;
+  if (!room.view || room.saving) return;
   $(".conflict").hidden = true;
-  const answer = await ask("save", { edits: room.edits, version, ...about() });
+  const at = { group: room.group, own: room.own }, { edits } = room, place = stored();
+  room.saving = true;
+  const answer = await ask("save", { edits, version, ...about() });
+  room.saving = false;
+  if (!here(at)) {  // somebody looks at another mask by now
+    if (answer.error) return say(`${at.group}: ${answer.error}`, true);
+    sessionStorage.removeItem(place);
+    say(`Saved: ${answer.saved}.`);
+    return list();
+  }
   if (answer.conflict) {
     $(".conflict").hidden = false;
     $(".conflict span").textContent = answer.error;
@@ -182,13 +196,14 @@ async function save(version = room.version) {
     return say(answer.error, true);
   }
   if (answer.error) return;
-  sessionStorage.removeItem(stored());
-  room.edits = [];
+  room.edits = room.edits.filter((one) => !edits.includes(one));  // what was drawn meanwhile is not saved
   room.version = answer.version;
+  keep();
   say(`Saved: ${answer.saved}. Looking at the group again with it.`);
-  const group = room.group;
-  await list(group);
-  if (await open(group, true)) say(`Saved: ${answer.saved}.`);
+  await list();
+  if (!here(at)) return;
+  if (room.edits.length) return draw();
+  if (await open(at.group, true)) say(`Saved: ${answer.saved}.`);
 }
 
 const actions = {

@@ -34,6 +34,7 @@ from gift_peft.reports.model_card import base_license, find_backbone
 from gift_peft.training import loop, start, train, upload
 from gift_peft.training.arguments import GiftTrainingArguments
 
+ROOT = Path(__file__).parents[2]
 ROW = {"step": 0, "epoch": 0, "val_gce": 0.5} | {
     f"val_{region}_{metric}": 0.25 for region in ("tom", "other", "all") for metric in METRICS
 }
@@ -68,6 +69,13 @@ def test_a_card_without_a_countable_group_has_no_nan(tmp_path):
             card = ModelCard(model_card.model_card(asdict(args), record | {"metrics": metrics}, reports))
             json.dumps(card.data.to_dict(), allow_nan=False)
             assert "nan" not in card.content.lower().split() and card.data.eval_results
+
+
+def test_a_card_asks_for_the_transformers_that_the_package_asks_for():
+    dependencies = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    least = next(line for line in dependencies if line.startswith("transformers")).partition(">=")[2]
+    template = Path(model_card.__file__).parent / "templates" / "model_card.md"
+    assert f"`pipeline` and `AutoModel` {least}:" in template.read_text(encoding="utf-8")
 
 
 def test_metadata_on_the_hub(tmp_path):
@@ -251,7 +259,6 @@ CARDS = {
     "metric3d_v2_giant": ("JUGGHM/Metric3D", "unknown", "1,377,675,099"),
     "moge_2_large": ("Ruicheng/moge-2-vitl-normal", "mit", "330,901,544"),
 }
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("name", CARDS)

@@ -1,0 +1,1 @@
+"""The parts of `benchmark_group_step.py`: the epoch, its models and inputs, and the page."""

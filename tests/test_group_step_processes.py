@@ -23,6 +23,7 @@ from helpers.tiny import tiny_model, tiny_processor, write_raw_tree
 
 from gift_peft.dataset.gift_i import load_gift_i
 from gift_peft.evaluation.evaluate import evaluate_gift_i
+from gift_peft.group_inputs import GroupInputs
 from gift_peft.group_step import GroupStep
 from gift_peft.training.teacher import make_proxies
 
@@ -71,6 +72,10 @@ def work(folder):
         answers[name, "trained"] = train(gift_model(dtype, spread=0), accelerator, dtype)
 
     answers["auto"] = [GroupStep(toy(), accelerator=accelerator).accumulate(*group(n, torch.float32)) for n in COUNTS]
+    for usual in (None, 3, 20):
+        step = GroupStep(toy(), micro_batch_size="auto", accelerator=accelerator)
+        data = GroupInputs(*group(9, torch.float32))
+        answers["chosen", usual] = step.choose_micro_batch_size(data, largest=30, usual=usual)
     model, (pixels, mask, target, _) = toy(), group(2, torch.float32)
     for parameter in model.parameters():
         parameter.grad = torch.full_like(parameter, 100)
@@ -172,6 +177,12 @@ def test_two_processes_add_this_group_only(two):
 def test_two_processes_retain_what_each_has_room_for(two):
     for answers in two:
         assert [output.forwards for output in answers["auto"]] == list(COUNTS)
+
+
+@pytest.mark.parametrize(("usual", "chosen"), [(None, 6), (3, 2), (20, 10)])
+def test_both_have_work_on_a_usual_group(two, usual, chosen):
+    """Memory would hold all of its images in one micro-batch, which leaves the second process without one."""
+    assert [answers["chosen", usual] for answers in two] == [chosen, chosen]
 
 
 def test_two_processes_raise_together(two):

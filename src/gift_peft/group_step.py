@@ -150,12 +150,13 @@ class GroupStep:
         cpu = [torch.tensor(term, dtype=canvas.dtype) for term in terms]
         return GroupStepOutput(*cpu, num_pairs=loss.num_pairs, forwards=2 * len(mask) - int(kept))
 
-    def choose_micro_batch_size(self, group: GroupInputs, largest: int | None = None) -> int:
+    def choose_micro_batch_size(self, group: GroupInputs, largest: int | None = None, usual: int | None = None) -> int:
         """Set and return the images per forward that memory allows, the least of all processes; at most 8 on CUDA.
 
-        The whole of the largest group, of `largest` images (default: this one), else an even number or 1. Measured
-        with one forward of two images, or of one where two are too many. Raises torch.OutOfMemoryError, on all
-        processes, where not even one fits.
+        The whole of the largest group, of `largest` images (default: this one), else an even number or 1. Several
+        processes take so few that a group of `usual` images (default: this one) has work for all. Measured with one
+        forward of two images, or of one where two are too many. Raises torch.OutOfMemoryError, on all processes,
+        where not even one fits.
         """
         budget = self.budget or GraphBudget(self.model, local_processes(self._world), self._casts)
         with self._casts or nullcontext(), torch.enable_grad():
@@ -164,6 +165,7 @@ class GroupStep:
         chosen = count if count < min(2, len(group)) else budget.widen(group.pixel_values, count, canvas)
         if self._world > 1:
             chosen = int(self.accelerator.gather(torch.tensor([chosen], device=self._parameters[0].device)).min())
+            chosen = min(chosen, 2 * math.ceil((usual or len(group)) / (2 * self._world)))
         if chosen == 0:
             raise torch.OutOfMemoryError("not even one image fits into memory")
         budget.reserve(group.pixel_values, count, chosen, canvas)

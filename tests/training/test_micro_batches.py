@@ -24,7 +24,7 @@ def test_the_choice_is_written_down_and_a_resumed_run_takes_it(base_dir, tree, t
     out = tmp_path / "out"
     asked = []
 
-    def choose(step, group, largest=None):
+    def choose(step, group, largest=None, usual=None):
         asked.append(largest)
         return 1
 
@@ -60,7 +60,7 @@ def test_a_group_that_fits_is_one_micro_batch(base_dir, tree, tmp_path, capsys):
 def test_blocks_are_recomputed_where_not_even_one_image_fits(base_dir, tree, tmp_path, monkeypatch, capsys):
     out, tried, checkpointed = tmp_path / "out", [], []
 
-    def choose(step, group, largest=None):
+    def choose(step, group, largest=None, usual=None):
         tried.append(bool(checkpointed))
         if not checkpointed:
             raise torch.OutOfMemoryError("not even one image fits into memory")

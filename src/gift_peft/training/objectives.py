@@ -5,6 +5,7 @@ update takes, `accumulate` of that, which puts a gradient into `.grad`, and `fir
 """
 
 import math
+import statistics
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from itertools import repeat
@@ -75,7 +76,8 @@ class Consensus:
             return {}
 
         def choose() -> int:
-            return self.step.choose_micro_batch_size(self._read(0).inputs, max(map(len, self.groups.image_names)))
+            sizes = [len(names) for names in self.groups.image_names]
+            return self.step.choose_micro_batch_size(self._read(0).inputs, max(sizes), round(statistics.median(sizes)))
 
         settled = settle_micro_batch(choose, before, self.step.model, self.args, self.accelerator)
         self.step.micro_batch_size = settled["micro_batch_size"]

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from benchmark.models import Config
 from PIL import Image
+
+from benchmark.models import Config
 
 
 def write_base(config: Config, folder: Path) -> None:

@@ -112,7 +112,7 @@ class _Level:
         gradients = np.array([[xx, xy], [xy, yy]]).transpose(2, 0, 1)
         energy = xx + yy
         mismatch = residual / (energy + 1e-6)  # as square pixels
-        usual = _weighted_quantile(mismatch, energy, 0.3)
+        usual = weighted_quantile(mismatch, energy, 0.3)
         weights = 1 / np.square(1 + mismatch / (2 * usual + 1e-6))
         return gradients, np.stack([gx_apart, gy_apart], 1), weights, both / np.sqrt(own * others + 1e-9)
 
@@ -189,7 +189,8 @@ def _quarter(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+def weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    """The value below which this share of the weights lies."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     return float(values[order][min(np.searchsorted(total, share * total[-1]), len(values) - 1)])

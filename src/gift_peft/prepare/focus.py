@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from gift_peft.prepare.camera_motion import weighted_quantile
+
 SIDE = 1280  # pixels of the longer side at most
 PLACES = 32  # along the longer side
 LEAST_SIDE = 10  # pixels of a place, else chance makes pictures alike
@@ -115,7 +117,7 @@ class _Level:
         if places.sum() < LEAST_PLACES or alike[self.telling].mean() < LEAST_ALIKE:
             return None
         weights = np.square(self.energy[places])  # strong edges: codecs smooth what is faint
-        apart = [_weighted_median((left - kept)[places], weights) for kept in self.kept]
+        apart = [weighted_quantile((left - kept)[places], weights, 0.5) for kept in self.kept]
         sharpness = 1 + apart[0]
         if apart[0] >= 0:
             return Blur(0.0, sharpness)
@@ -154,9 +156,3 @@ class _Level:
 def _band(image: np.ndarray, sigmas: tuple[float, float]) -> np.ndarray:
     narrow, wide = (cv2.GaussianBlur(image, (0, 0), sigma) for sigma in sigmas)
     return narrow - wide
-
-
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, total[-1] / 2)])

@@ -49,9 +49,10 @@ def segment(picture: np.ndarray, change: np.ndarray, noise: float, clicks: Seque
     seed = np.zeros(change.shape, bool)
     for hit in hits:
         seed |= _region_at(hit, regions, seed, change, lab)
+    features = _features(lab, change, noise)
     if misses:
-        seed = _cut(seed, hits, misses, lab, change, noise)
-    return _draw_border(seed, hits, misses, lab, change, noise)
+        seed = _cut(seed, hits, misses, features)
+    return _draw_border(seed, hits, misses, features)
 
 
 def cut_away(
@@ -69,7 +70,7 @@ def cut_away(
         depth = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
         away = np.minimum(depth, _distance(misses, mask.shape) / 2)  # in the middle, and not under a click
         hits = [np.unravel_index(int(away.argmax()), mask.shape)]
-    return _cut(mask, hits, misses, cv2.cvtColor(picture, cv2.COLOR_RGB2LAB), change, noise)
+    return _cut(mask, hits, misses, _features(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB), change, noise))
 
 
 def _place(click: Click, shape: tuple[int, ...]) -> tuple[int, int]:
@@ -122,16 +123,12 @@ def _features(lab: np.ndarray, change: np.ndarray, noise: float) -> np.ndarray:
     """(h, w, 3) uint8, in which a target differs from what is beside it: change, lightness and color in one."""
     level = np.log1p(np.minimum(change / noise, CEILING)) / np.log1p(CEILING)
     color = np.clip((lab[..., 1].astype(np.float32) + lab[..., 2] - 256) / 2 + 128, 0, 255)
-    return np.dstack([255 * level, lab[..., 0].astype(np.float32) / 2 + 64, color]).astype(np.uint8)
+    features = np.dstack([255 * level, lab[..., 0].astype(np.float32) / 2 + 64, color])
+    return np.ascontiguousarray(features.astype(np.uint8))  # as opencv takes it
 
 
 def _cut(
-    seed: np.ndarray,
-    hits: Sequence[tuple[int, int]],
-    misses: Sequence[tuple[int, int]],
-    lab: np.ndarray,
-    change: np.ndarray,
-    noise: float,
+    seed: np.ndarray, hits: Sequence[tuple[int, int]], misses: Sequence[tuple[int, int]], features: np.ndarray
 ) -> np.ndarray:
     """The seed without what belongs to the clicks beside the target, which is at most what is nearer to one of them.
 
@@ -143,7 +140,7 @@ def _cut(
     markers[seed & (to_hit < SURE * to_miss)] = 1
     markers[to_miss <= radius] = 2
     markers[to_hit <= radius] = 1
-    parts = cv2.watershed(np.ascontiguousarray(_features(lab, change, noise)), markers)
+    parts = cv2.watershed(features, markers)
     return seed & (parts != 2)
 
 
@@ -155,12 +152,7 @@ def _distance(places: Sequence[tuple[int, int]], shape: tuple[int, ...]) -> np.n
 
 
 def _draw_border(
-    seed: np.ndarray,
-    hits: Sequence[tuple[int, int]],
-    misses: Sequence[tuple[int, int]],
-    lab: np.ndarray,
-    change: np.ndarray,
-    noise: float,
+    seed: np.ndarray, hits: Sequence[tuple[int, int]], misses: Sequence[tuple[int, int]], features: np.ndarray
 ) -> np.ndarray:
     """The seed with its border where change and colors end, at most `BAND` away; then holes are filled."""
     reach = _length(BAND, seed.shape)
@@ -180,8 +172,7 @@ def _draw_border(
     models, part = (np.zeros((1, 65)), np.zeros((1, 65))), _surroundings(around, 10 * reach)
     near = np.ascontiguousarray(marks[part])
     if (near == cv2.GC_BGD).any():
-        features = np.ascontiguousarray(_features(lab, change, noise)[part])
-        cv2.grabCut(features, near, None, *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(np.ascontiguousarray(features[part]), near, None, *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
         marks[part] = near
     found = ((marks == cv2.GC_FGD) | (marks == cv2.GC_PR_FGD)).astype(np.uint8)
     _, background = cv2.connectedComponents(1 - np.pad(found, 1), connectivity=4)

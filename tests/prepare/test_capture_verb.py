@@ -14,7 +14,7 @@ from helpers.clips import Making, pushed, views
 from gift_peft.captures.clip import ClipFrame
 from gift_peft.cli import main
 from gift_peft.prepare import capture_session
-from gift_peft.prepare.capture_session import Session
+from gift_peft.prepare.capture_session import TYPED, Session
 
 SIZE = (240, 320)
 
@@ -125,11 +125,11 @@ def test_what_holds_something_else_stays_as_it_is(tmp_path, files, message):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=message):
-        Session(tmp_path, None, None, 12, None, asks=False)
+        Session(tmp_path)
     file = tmp_path / "file"
     file.write_text("mine")
     with pytest.raises(ValueError, match="is a file: name a folder"):
-        Session(file, None, None, 12, None, asks=False)
+        Session(file)
 
 
 def test_masks_that_do_not_fit_are_named(tmp_path, capsys):
@@ -148,7 +148,7 @@ def test_what_a_person_types(tmp_path):
     picture = views(6, SIZE, 1)[0][0]
     made = Making(SIZE)
     made.hold(picture, 4.0)
-    session = Session(tmp_path / "raw", "door", None, 12, None, asks=True)
+    session = Session(tmp_path / "raw", "door", asks=TYPED)
     typed, said = {2: "r", 20: "", 21: "help", 45: "r"}, []
     for index, frame in enumerate(made.frames):
         said += session.see(ClipFrame(index, index / 15, frame), typed.get(index))
@@ -177,7 +177,7 @@ def test_ctrl_c_keeps_what_was_taken(tmp_path, capsys, monkeypatch):
 
 
 def test_frames_of_another_size_end_it_and_photos_stay(tmp_path):
-    made, session = Making(SIZE), Session(tmp_path / "raw", "door", None, 12, None, asks=True)
+    made, session = Making(SIZE), Session(tmp_path / "raw", "door", asks=TYPED)
     made.hold(views(6, SIZE, 1)[0][0], 1.5)
     for index, frame in enumerate(made.frames):
         session.see(ClipFrame(index, index / 15, frame))
@@ -194,7 +194,7 @@ def test_a_reference_before_any_photo_leaves_nothing(tmp_path, capsys):
 
 
 def test_q_after_r_ends_without_a_reference(tmp_path):
-    made, session = Making(SIZE), Session(tmp_path / "raw", "door", None, 12, None, asks=True)
+    made, session = Making(SIZE), Session(tmp_path / "raw", "door", asks=TYPED)
     made.hold(views(6, SIZE, 1)[0][0], 1.5)
     for index, frame in enumerate(made.frames):
         session.see(ClipFrame(index, index / 15, frame), {len(made.frames) - 1: "r"}.get(index))

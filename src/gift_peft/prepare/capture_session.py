@@ -69,8 +69,9 @@ def check_tree(out: Path) -> None:
     except FileNotFoundError:
         folders = []
     files = [found for folder in folders if (found := list(files_below(folder)))]
-    empty = not files and not any(path.is_file() for path in there)
-    if not folders or not (files or empty) or not all(any(map(is_image_file, one)) or find_clips(one) for one in files):
+    loose = not files and any(path.is_file() for path in there)
+    others = [one for one in files if not any(map(is_image_file, one)) and not find_clips(one)]
+    if not folders or loose or others:
         raise ValueError(f"OUT {out} holds something else than groups of photos: name another folder")
 
 

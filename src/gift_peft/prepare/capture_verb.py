@@ -55,7 +55,8 @@ def run(argv: Sequence[str]) -> int:
     live = source.clip is None
     if at is not None and live:
         raise ValueError("--reference-at is for clips; at a camera, type r and Enter when the surface is treated")
-    session = Session(Path(args.out), args.group, args.mask, args.max_frames, at and at.seconds, TYPED if live else None)
+    asks = TYPED if live else None
+    session = Session(Path(args.out), args.group, args.mask, args.max_frames, at and at.seconds, asks)
     typed = _typed() if live and sys.stdin.isatty() else itertools.repeat(None)
     status = _Status()
     frames = source.frames()

@@ -297,6 +297,9 @@ def test_a_dropped_photo_goes_and_comes_only_when_it_is_asked_for(tmp_path):
     session.drop(session.references[0])
     session.drop(last)
     assert not session.folder.exists() and session.photos == {}
+    session.resume()
+    assert "door/001.png" in watched(session, [pictures[0]], 2.0)  # the folder is ours, and the group begins anew
+    session.drop(session.photos[session.folder][0])
     for other in (last, tmp_path / "m.png", first):
         with pytest.raises(ValueError, match="no photo that was taken here"):
             session.drop(other)

@@ -16,7 +16,7 @@ from gift_peft.captures.live import live_frames
 from gift_peft.captures.tree import find_groups
 from gift_peft.files import is_leftover
 from gift_peft.images import is_image_file, open_image, to_mask
-from gift_peft.prepare.coach import Advice, Coach
+from gift_peft.prepare.coach import BLINK, Advice, Coach
 from gift_peft.rules import SPLITS, check_group_id
 
 PAUSE = 2.0  # seconds, as which the time counts in which a stream was closed
@@ -131,7 +131,9 @@ class Session:
         self.ended = False
         self.frames, self.seconds = 0, 0.0
         self.size: tuple[int, int] | None = None  # (height, width) of the frames
+        self._last_still = float("-inf")  # seconds
         self._before = 0, 0.0  # frames and seconds of streams that ended
+        self._began: set[Path] = set()  # folders of groups that are ours
         self._masks: dict[Path, int] = {}  # of each group that has one of ours, when it was written
         self._reference_due = self._said_enough = False
         self._said: frozenset[str] = frozenset()
@@ -171,7 +173,7 @@ class Session:
             text = f"keep still: the next still moment is {what}"
         elif advice.enough:
             text = f"{ENOUGH}; {TREAT.format(self.asks)}" if self.asks else ENOUGH
-        elif not advice.still:
+        elif self.seconds - self._last_still > BLINK:
             text = "hold camera and scene still for a second"
         elif self.coach.waits:
             text = "change what is reflected or seen through, and step aside"
@@ -208,6 +210,8 @@ class Session:
             self.advice = self.coach.see(index, seconds, frame.pixels)
         except ValueError as error:
             raise ValueError(f"{self.mask_file}: {error}") from None
+        if self.advice.still:
+            self._last_still = seconds
         if self.advice.new_group:
             self.folder, self._said_enough = self._next_folder(), False
             said.append(f"the camera stays where it is now: the next photos are a new group, {self.folder}")
@@ -341,8 +345,9 @@ class Session:
     def _write(self, advice: Advice) -> Path:
         """The photo in its group; the folder of one that another program has filled meanwhile is left alone."""
         taken = self.photos.get(self.folder, ())
-        if not taken and not self._is_free(self.folder):
+        if not taken and self.folder not in self._began and not self._is_free(self.folder):
             self.folder = self._next_folder()
+        self._began.add(self.folder)
         number = int(taken[-1].stem) + 1 if taken else 1
         path = self.folder / ("reference.png" if advice.is_reference else f"{number:03d}.png")
         if path.exists():

@@ -163,7 +163,7 @@ class Coach:
         group.dropped += [] if again else [cells]
         group.old_changes = 0
         if not group.cells:
-            self.group = _Group(dropped=group.dropped)
+            self.group = _Group(dropped=group.dropped[-1:])
             self.wanted = None if self.wanted == "reference" else self.wanted
         self._advice = replace(self._advice, changed=self._changed() if group.cells else 0.0, enough=False)
         self.restart()

@@ -25,6 +25,7 @@ GONE = 8.0  # seconds without a question, after which a tab counts as closed
 PATIENCE = 1.0  # seconds that a question waits for the next picture
 CLOSING = 5.0  # seconds that closing a camera may take
 SIDE, THUMBNAIL = 960, 320  # pixels: the longer side of what is shown
+TEAL = (0, 200, 190)  # of the target's border
 LINES = 8  # of what was said, that are shown
 ASKED = "press R; Q ends without one"
 TYPED = {"photo": "", "reference": "r"}  # buttons of the page, as they are typed in a terminal
@@ -40,11 +41,10 @@ class CaptureRoom:
         root (`Path`): RAW; it may be absent.
         source (`Source`): where frames come from.
         mask (`str`, *optional*): file of the target's mask.
-        most (`int`): photos of a group.
     """
 
-    def __init__(self, root: Path, source: Source, mask: str | None = None, most: int = 12) -> None:
-        self.root, self.source, self.mask, self.most = root, source, mask, most
+    def __init__(self, root: Path, source: Source, mask: str | None = None) -> None:
+        self.root, self.source, self.mask = root, source, mask
         self.session: Session | None = None
         self._news = threading.Condition()  # for what follows, which the page sees
         self._tab, self._asked = "", 0.0  # who captures, and when it asked last
@@ -80,7 +80,7 @@ class CaptureRoom:
             answer = {"state": state, "number": number, "version": self._version, **self._shown}
             answer |= {"said": list(self._said), "wrong": self._wrong}
         if running and pixels is not None and number != seen:
-            answer["picture"] = jpeg_uri(_small(pixels, SIDE), quality=80)
+            answer["picture"] = jpeg_uri(_small(pixels, SIDE, self.session.coach.mask_here), quality=80)
         return answer if running else answer | self._between()
 
     def start(self, request: dict) -> dict:
@@ -94,7 +94,7 @@ class CaptureRoom:
         out = checked(self.root / str(split), self.root) if splits else self.root
         with self._news:
             self._check_free(tab)
-            session = Session(out, name.strip() or None, self.mask, self.most, asks=ASKED)
+            session = Session(out, name.strip() or None, self.mask, asks=ASKED)
             self.session, self._version = session, self._version + 1
             self._thumbnails.clear()
             self._said.clear()
@@ -207,6 +207,7 @@ class CaptureRoom:
         return {
             "group": session.folder.name,
             "figures": session.figures,
+            "of": "picture" if session.mask is None else "target",  # what has changed
             "next": session.next_step,
             "well": not session.advice.warnings,
             "enough": session.advice.enough,
@@ -281,11 +282,14 @@ def _tab(request: dict) -> str:
     return tab
 
 
-def _small(pixels: np.ndarray, side: int) -> Image.Image:
-    """A frame (H, W, 3) uint8 BGR, at most so large."""
+def _small(pixels: np.ndarray, side: int, mask: np.ndarray | None = None) -> Image.Image:
+    """A frame (H, W, 3) uint8 BGR, at most so large, with the border of a mask (H, W) bool."""
     height, width = pixels.shape[:2]
     scale = min(1.0, side / max(height, width))
-    if scale < 1:
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    return Image.fromarray(np.ascontiguousarray(pixels[..., ::-1]))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = pixels[..., ::-1] if scale == 1 else cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)[..., ::-1]
+    small = np.ascontiguousarray(small)
+    if mask is not None and mask.shape == (height, width):
+        there = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        cv2.drawContours(small, cv2.findContours(there, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0], -1, TEAL, 2)
+    return Image.fromarray(small)

@@ -51,6 +51,7 @@ function show(answer) {
   room.state = answer.state;
   if (answer.picture) { $(".picture").src = answer.picture; room.seen = answer.number; }
   for (const [name, text] of Object.entries(answer.figures || {})) $(`[data-figure=${name}]`).textContent = text;
+  if (answer.of) $(".of").textContent = answer.of;
   $(".enough").hidden = !answer.enough;
   $(".count").textContent = answer.photos ?? 0;
   if (runs && answer.photos > room.photos) beep([880, 1320]);

@@ -57,13 +57,12 @@ def test_photos_are_taken_one_is_dropped_and_the_mask_comes_next(browser, tmp_pa
         tab.said("^Click on the mirror")
         assert tab.page.locator("#masks .group").input_value() == "train/door"
         assert tab.page.locator("#masks .strip li").count() == 3
-        # Again, now that the Masks room is there already; the second group ends early, by the keyboard.
+        # Again, now that the Masks room is there already, and while photos are still taken.
         tab.page.get_by_role("tab", name="Capture").click()
         room.locator(".group").fill("")
         room.get_by_role("button", name="Start").click()
-        room.locator(".strip li").first.wait_for()
-        tab.page.keyboard.press("q")
-        room.locator(".next").get_by_text("group_1: ").wait_for()
+        room.get_by_role("button", name="Drop group_1/001.png").click()
+        room.get_by_role("button", name="Drop group_1/001.png").wait_for()  # of the next view
         room.get_by_role("button", name="Draw the mask").click()
         tab.page.wait_for_function("document.querySelector('#masks .group').value === 'train/group_1'")
         tab.said("^Click on the mirror")
@@ -73,15 +72,23 @@ def test_photos_are_taken_one_is_dropped_and_the_mask_comes_next(browser, tmp_pa
         assert photo.size == SIZE[::-1] and np.asarray(photo).std() > 10
 
 
-def test_a_closed_tab_stops_the_camera_and_photos_stay(browser, tmp_path):
+def test_keys_end_it_and_a_closed_tab_stops_the_camera(browser, tmp_path):
     source, raw = clip(tmp_path / "a.mp4", 4, 12), tmp_path / "raw"
     with studio(raw, "--source", source) as url:
         tab = Watched(browser, url)
-        tab.page.locator("#capture").get_by_role("button", name="Start").click()
-        tab.page.locator("#capture .strip li").first.wait_for()
+        room = tab.page.locator("#capture")
+        room.get_by_role("button", name="Start").click()
+        room.get_by_role("button", name="Drop group_1/001.png").click()  # and the keys are still the room's
+        room.locator(".log").get_by_text("dropped").wait_for()
+        tab.page.keyboard.press("p")
+        room.locator(".strip li").first.wait_for()
+        tab.page.keyboard.press("q")
+        room.locator(".next").get_by_text("group_1: ").wait_for()
+        room.get_by_role("button", name="Start").click()
+        room.get_by_role("button", name="Drop group_2/001.png").wait_for()
         tab.close()
         later = Watched(browser, url)
         later.page.locator("#capture .log").get_by_text("the page was closed, and the camera is off").wait_for()
-        later.page.locator("#capture .next").get_by_text("group_1: ").wait_for()
+        later.page.locator("#capture .next").get_by_text("group_2: ").wait_for()
         later.close()
-    assert 1 <= len(list((raw / "group_1").iterdir())) < 12
+    assert 1 <= len(list((raw / "group_2").iterdir())) < 12

@@ -301,7 +301,7 @@ class Coach:
                 self.group.old_changes += self._stirred
                 self._stirred = False
                 count = len(self.group.cells)
-                last = f"the last of {count} photos" if count else "the photo that was dropped"
+                last = {0: "the photo that was dropped", 1: "the photo"}.get(count, f"the last of {count} photos")
                 text = f"nothing new shows since {last}: change what is reflected or seen through"
                 self._nothing_new = Remark("unchanged", text)
                 self._say(seconds, self._wrong)

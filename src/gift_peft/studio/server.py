@@ -42,6 +42,8 @@ POLICY = (
 LARGEST_PHOTO = "100mb"
 # The viewer of points tries WebGPU first and complains where a browser has it without a device; WebGL does as well.
 HEAD = "<script>delete Navigator.prototype.gpu;</script>"
+# On a telephone, too, all rooms have their tab in sight.
+HEAD += "<style>@media (max-width: 600px) { .tab-container button { padding: 0 .4rem !important } }</style>"
 
 
 @dataclass

@@ -103,6 +103,8 @@ async function strip() {
     item.append(picture, what);
     return item;
   }));
+  const lost = document.activeElement === document.body && $(".live").offsetParent;  // with the button that was pressed
+  if (lost) $(".live").focus({ preventScroll: true });
 }
 
 async function watch() {
@@ -135,7 +137,7 @@ const actions = {
     if (!room.groups.length) return;
     window.studioGroup = room.groups.at(-1);  // the Masks room may not be there yet
     window.dispatchEvent(new Event("studio group"));
-    [...document.querySelectorAll("[role=tab]")].find((one) => one.textContent.trim() === "Masks").click();
+    [...document.querySelectorAll("[role=tab], .overflow-dropdown button")].find((one) => one.textContent.trim() === "Masks").click();
   },
 };
 

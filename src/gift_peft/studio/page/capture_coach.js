@@ -94,7 +94,7 @@ async function strip() {
     if (one.picture) picture.src = one.picture;
     picture.alt = one.name;
     what.className = "what";
-    name.textContent = one.name;
+    name.append(one.name.split("/")[0], "/", document.createElement("wbr"), one.name.split("/")[1]);
     button.type = "button";
     button.textContent = "Drop";
     button.setAttribute("aria-label", `Drop ${one.name}`);

@@ -242,6 +242,7 @@ def test_empty_group_folders_are_passed_over_and_filled(tmp_path):
     session = Session(tmp_path / "raw", "door")
     watched(session, views(3, SIZE, 1)[0])
     assert [path.name for path in (tmp_path / "raw/door").iterdir()] == ["001.png"]
+    assert "Without photos yet, which `prepare` will say, too: later." in session.finish("0")
     (tmp_path / "raw/hall/1.png").unlink()
     Session(tmp_path / "raw", "hall")
     with pytest.raises(ValueError, match="door: it is there already; name another group"):

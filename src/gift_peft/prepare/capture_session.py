@@ -64,15 +64,20 @@ def check_tree(out: Path) -> None:
             raise ValueError(f"OUT {out} has a folder {split}: name one of its splits, as {out / split}")
     if (out / "metadata.parquet").exists():
         raise ValueError(f"OUT {out} is part of a prepared folder: name a folder of photos as they were taken")
-    try:
-        folders = [folder for found in find_groups(out).values() for folder in found]
-    except FileNotFoundError:
-        folders = []
-    files = [found for folder in folders if (found := list(files_below(folder)))]
+    groups = _files_of_groups(out)
+    files = list(filter(None, groups.values()))
     loose = not files and any(path.is_file() for path in there)
     others = [one for one in files if not any(map(is_image_file, one)) and not find_clips(one)]
-    if not folders or loose or others:
+    if not groups or loose or others:
         raise ValueError(f"OUT {out} holds something else than groups of photos: name another folder")
+
+
+def _files_of_groups(out: Path) -> dict[Path, list[Path]]:
+    """What lies in each group's folder of a raw tree; nothing where there are none."""
+    try:
+        return {folder: list(files_below(folder)) for found in find_groups(out).values() for folder in found}
+    except FileNotFoundError:
+        return {}
 
 
 def _contents(folder: Path) -> list[Path]:
@@ -286,6 +291,8 @@ class Session:
         if self.mask is None:
             place = next(iter(self.photos)) / "mask.png"
             lines.append(f"Draw the target in {place}, white where the glass or mirror is.")
+        if empty := [folder.name for folder, files in _files_of_groups(self.out).items() if not files]:
+            lines.append(f"Without photos yet, which `prepare` will say, too: {', '.join(empty)}.")
         raw = self.out
         if Path(os.path.abspath(raw)).name in SPLITS:  # a split of the raw tree above
             raw = raw.parent if raw.name not in ("", "..") else raw / ".."

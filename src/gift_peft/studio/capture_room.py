@@ -56,6 +56,7 @@ class CaptureRoom:
         self._typed: deque[str] = deque()
         self._said: deque[str] = deque(maxlen=LINES)
         self._wrong: str | None = None
+        self._ended: tuple[tuple, dict] | None = None  # what is said at the end, and of which state
         self._taking = threading.Lock()  # one asks the session at a time
         self._thumbnails: dict[Path, str] = {}
 
@@ -241,9 +242,11 @@ class CaptureRoom:
         if self.session is None:
             return answer
         with self._taking:
-            told, wrong = self._finished()
-            more = {"told": told, "groups": self._groups(), "resumes": self._can_resume()}
-        return answer | more | ({"wrong": wrong} if wrong else {})
+            key = self._version, self.session.frames, self._wrong
+            if self._ended is None or self._ended[0] != key:  # looking through a large RAW takes its time
+                told, wrong = self._finished()
+                self._ended = key, {"told": told, "groups": self._groups(), "wrong": wrong}
+            return answer | self._ended[1] | {"resumes": self._can_resume()}
 
     def _finished(self) -> tuple[list[str], str | None]:
         """What is said at the end, or what is wrong."""

@@ -54,7 +54,9 @@ def part(groups: list[Observed], which: str | int) -> list[Observed]:
 TRAIN = (("train", "all"),)
 OLD = (("validation", "all"),)
 BOTH = (*TRAIN, ("singles", 318))
+MANY = (*TRAIN, ("singles", 1000))
 FRESH = (("fresh_1", "all"), ("fresh_2", "all"), ("fresh_3", "all"))
+UNSEEN = (("fresh_4", "all"), ("fresh_5", "all"), ("fresh_6", "all"))  # rendered after FRESH had been looked at
 
 
 def first(name: str, **options) -> Trial:
@@ -121,6 +123,13 @@ STAGES = {
     "more": [
         report("surface targets, 24 epochs", epochs=24),
         Trial("groups and 318 single photos, 18 epochs", BOTH, FRESH, **CHOSEN | {"epochs": 18}),
+    ],
+    # Four times the scenes, on sets that nothing had been scored on; the older validation groups choose.
+    "many": [
+        Trial("groups and 1000 single photos", MANY, (*OLD, *UNSEEN, *FRESH), **CHOSEN),
+        Trial("groups and 1000 single photos, lambda_c 1", MANY, (*OLD, *UNSEEN, *FRESH), **CHOSEN | {"lambda_c": 1.0}),
+        Trial("groups alone", TRAIN, (*OLD, *UNSEEN), **CHOSEN),
+        Trial("paper's objective, groups alone", TRAIN, (*OLD, *UNSEEN), **CHOSEN | PAPER),
     ],
     # The paper's objective over the grid, on the older validation groups.
     "paper's grid": [

@@ -26,7 +26,7 @@ from gift_peft.dataset.loader import epoch_flips, epoch_order
 from gift_peft.evaluation.alignment import align
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.surface_targets import surface_target
-from gift_peft.training.speed import use_channels_last
+from gift_peft.training.speed import channels_last_head
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
 BASE = Path(__file__).resolve().parents[3] / "src" / "gift_peft" / "demo" / "base"
@@ -82,7 +82,6 @@ def train(trial: plan.Trial, groups: list[Observed], seed: int, store: Path):
     base, processor = load_base(BASE)
     torch.manual_seed(seed)
     network = get_gift_model(base).eval()
-    use_channels_last(network)
     parameters = [p for p in network.parameters() if p.requires_grad]
     optimizer = torch.optim.Adam(parameters, lr=trial.rate)
     helper = DepthModel(network, processor, SIZE)
@@ -93,10 +92,11 @@ def train(trial: plan.Trial, groups: list[Observed], seed: int, store: Path):
     else:
         update, feed, epoch = _surface(network, trial, groups, inputs, seed, store)
     total = trial.updates or trial.epochs * epoch
-    for number, item in zip(tqdm(range(total), trial.name, mininterval=20), feed, strict=False):
-        optimizer.param_groups[0]["lr"] = trial.rate * (1 - number / total)
-        update(item)
-        optimizer.step()
+    with channels_last_head(network):
+        for number, item in zip(tqdm(range(total), trial.name, mininterval=20), feed, strict=False):
+            optimizer.param_groups[0]["lr"] = trial.rate * (1 - number / total)
+            update(item)
+            optimizer.step()
     return helper, time.perf_counter() - began
 
 

@@ -23,7 +23,11 @@ class Rule:
 
 @dataclass(frozen=True)
 class Trial:
-    """One training. `rule` None is the paper's objective; `train` and `score` are (set, `part`) pairs."""
+    """One training. `rule` None is the paper's objective; `train` and `score` are (set, `part`) pairs.
+
+    `jitter` is the largest relative change of brightness, contrast and, a third of it, of each color's share, drawn
+    anew for each photo of an update.
+    """
 
     name: str
     train: tuple[tuple[str, str | int], ...]
@@ -37,6 +41,7 @@ class Trial:
     updates: int = 0
     batch: int = 4
     flips: bool = True
+    jitter: float = 0.0
 
     def describe(self) -> dict:
         return asdict(self)
@@ -89,6 +94,11 @@ STAGES = {
         first("auto without fills lambda_c 1.2 8 epochs", rule=Rule(fills=0, **HIGH), lambda_c=1.2, epochs=8),
         first("consensus", **PAPER),
         first("consensus 8 epochs", **PAPER, epochs=8),
+    ],
+    "levers": [
+        first("groups alone", **CHOSEN),
+        first("groups, colors changed", jitter=0.3, **CHOSEN),
+        first("groups, lambda_d 1.8", **CHOSEN | {"lambda_d": 1.8}),
     ],
     "main": [report("surface targets"), report("paper's objective", **PAPER)],
     "controls": [

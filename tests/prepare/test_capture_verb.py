@@ -370,3 +370,53 @@ def test_what_to_do_next_is_one_sentence(tmp_path):
     assert session.next_step == "Keep still: the next still moment is the treated reference."
     assert session.figures.keys() == {"drift", "sharp", "white", "black", "changed"}
     assert all(f"{name} {value}" in session.status for name, value in session.figures.items())
+
+
+def test_a_mask_that_somebody_drew_is_never_written_over(tmp_path):
+    pictures, mask = views(3, SIZE, 2)
+    cv2.imwrite(str(tmp_path / "m.png"), mask.astype(np.uint8) * 255)
+    session = Session(tmp_path / "raw", "door", str(tmp_path / "m.png"))
+    watched(session, pictures[:1])
+    (photo,), drawn = session.photos[session.folder], session.folder / "mask.png"
+    drawn.write_bytes(b"drawn better")
+    session.drop(photo)
+    watched(session, pictures[1:], 2.0)
+    assert photo.exists() and drawn.read_bytes() == b"drawn better"
+
+
+@pytest.mark.parametrize("other", ["masks/002.png", "002.jpg", "002.json", "002_mask.png", "002.png"])
+def test_a_photo_takes_no_number_that_a_file_of_somebody_else_has(tmp_path, other):
+    """A mask of its own would become the mask of the photo that comes in place of a dropped one."""
+    pictures, _ = views(3, SIZE, 2)
+    session = Session(tmp_path / "raw", "door")
+    watched(session, pictures[:1])
+    (session.folder / other).parent.mkdir(exist_ok=True)
+    (session.folder / other).write_bytes(b"of somebody else")
+    watched(session, pictures[1:])
+    assert [path.name for path in session.photos[session.folder]] == ["001.png", "003.png"]
+    assert (session.folder / other).read_bytes() == b"of somebody else"
+
+
+def test_the_end_asks_for_masks_that_are_not_there(tmp_path):
+    session = Session(tmp_path / "raw", "door")
+    watched(session, views(3, SIZE, 1)[0])
+    assert f"Draw the target in {session.folder / 'mask.png'}" in "\n".join(session.finish("0"))
+    (session.folder / "mask.png").write_bytes(b"drawn")
+    assert "Draw the target" not in "\n".join(session.finish("0"))
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\tb", "\ud800", "caf\udce9"])
+def test_names_that_are_no_text_are_refused_in_a_line(tmp_path, name):
+    with pytest.raises(ValueError, match="no text") as told:
+        Session(tmp_path / "raw", name)
+    str(told.value).encode()
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes on Linux alone")
+def test_a_folder_whose_name_is_no_text_is_named_so_that_it_can_be_told(tmp_path):
+    (tmp_path / "raw").mkdir()
+    os.mkdir(os.fsencode(tmp_path / "raw") + b"/caf\xe9")
+    session = Session(tmp_path / "raw", "door")
+    watched(session, views(3, SIZE, 1)[0])
+    assert r"too: caf\udce9." in "\n".join(session.finish("0"))

@@ -20,7 +20,7 @@ def clip(path, seed, count):
     return made.write(path)
 
 
-def dropped(tab, after="photo"):
+def dropped(tab, after="photo /"):
     """Wait until the log says that a photo was dropped, and another one taken since; the strip shows it later."""
     script = "after => new RegExp(`dropped .*${after}`).test(document.querySelector('#capture .log').textContent)"
     tab.page.wait_for_function(script, arg=after)

@@ -1,6 +1,7 @@
 """A capture on its way: frames come in, the coach judges them, photos go into groups of a raw tree."""
 
 import errno
+import itertools
 import os
 import re
 import unicodedata
@@ -75,10 +76,8 @@ def check_tree(out: Path) -> None:
 
 def read_target(mask: str | None) -> np.ndarray | None:
     """The target that a file shows, (H, W) bool. Raises ValueError or an OSError naming the file."""
-    if mask is None:
-        return None
-    target = to_mask(open_image(mask), mask)
-    if not target.any():
+    target = None if mask is None else to_mask(open_image(mask), mask)
+    if target is not None and not target.any():
         raise ValueError(f"{mask}: the mask is empty; draw the target in white")
     return target
 
@@ -134,8 +133,7 @@ class Session:
     ) -> None:
         check_tree(out)
         self.out, self.reference_at, self.asks = out, reference_at, asks
-        self.mask_file = mask
-        self.mask = read_target(mask)
+        self.mask_file, self.mask = mask, read_target(mask)
         self.name = free_name(out) if group is None else self._checked_name(group)
         self.folder = out / self.name
         self.coach = Coach(self.mask, most)
@@ -388,10 +386,8 @@ class Session:
     def _free_number(self) -> int:
         """Of the next photo: no file has it, not even the mask of a photo that was dropped, which would become its."""
         taken = self.photos.get(self.folder)
-        number = int(taken[-1].stem) + 1 if taken else 1
-        while any(self.folder.rglob(f"{number:03d}*")):
-            number += 1
-        return number
+        first = int(taken[-1].stem) + 1 if taken else 1
+        return next(number for number in itertools.count(first) if not any(self.folder.rglob(f"{number:03d}*")))
 
     def _remove_empty(self, folder: Path) -> None:
         """A group without photos goes, unless something of somebody else's is in it."""

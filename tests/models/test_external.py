@@ -76,6 +76,8 @@ def packages(monkeypatch):
             raise KeyError("model_config")
         if name == "text":
             raise pickle.UnpicklingError("Weights only load failed.\nmore lines")
+        if name == "letter":
+            raise KeyError(101)
         return StandInMoGe(metric=True)
 
     def model_class(load):
@@ -164,6 +166,8 @@ def test_what_is_missing_or_wrong_is_one_line(packages, monkeypatch):
         DepthModel.from_pretrained("moge:broken")
     with pytest.raises(ValueError, match=r"^base moge:text: Weights only load failed\.$"):
         DepthModel.from_pretrained("moge:text")
+    with pytest.raises(ValueError, match=r"^base moge:letter: not a file of weights \(101\)$"):
+        DepthModel.from_pretrained("moge:letter")
     with pytest.raises(ValueError, match="base moge:known: an adapter needs a model of transformers"):
         DepthModel.from_pretrained("moge:known", adapter="somewhere")
     with pytest.raises(ValueError, match=r"size 71x98: both sides must be positive multiples of the patch size 14"):

@@ -76,7 +76,9 @@ def load_external(base: Any) -> tuple[ExternalDepth, DPTImageProcessorPil]:
     except OSError as error:
         raise FileNotFoundError(f"base {base}: {reason(error)}") from None
     except NOT_ITS_WEIGHTS as error:
-        raise ValueError(f"base {base}: {reason(error)}") from None
+        told = reason(error)
+        why = f"not a file of weights ({told})" if told.isdigit() else told  # what unpickling says of other files
+        raise ValueError(f"base {base}: {why}") from None
 
 
 # ---- Depth Anything 3 ----

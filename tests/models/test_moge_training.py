@@ -78,7 +78,7 @@ def test_an_adapter_is_deployed_as_a_plain_model(name, head, tiny_vit, tmp_path)
     tiny_moge(name=name).save_pretrained(tmp_path / "base")
     MogeImageProcessorPil().save_pretrained(tmp_path / "base")
     adapted = trained(get_gift_model(tiny_moge(name=name), rank=2, head=head))
-    save_adapter(adapted, tmp_path / "adapter", str(tmp_path / "base"), size=SIZE)
+    save_adapter(adapted, tmp_path / "adapter", str(tmp_path / "base"), processor=MogeImageProcessorPil(), size=SIZE)
     deploy_transformers(tmp_path / "adapter", tmp_path / "merged")
     merged = DepthModel.from_pretrained(tmp_path / "merged")
     unit = 1 if name == "v1" else 1000

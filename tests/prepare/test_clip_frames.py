@@ -77,6 +77,33 @@ def test_a_push_of_the_camera_begins_a_new_group(tmp_path, pixels, known_mask):
     assert "the camera was moved" in choice.notes[0]
 
 
+@pytest.mark.parametrize("seed", [3, 5])
+def test_after_a_push_the_target_is_looked_for_where_it_then_is(tmp_path, seed):
+    pictures, mask = views(seed, SIZE, 4)
+    made = Making(SIZE)
+    for index, picture in enumerate([*pictures, *pictures]):
+        made.hold(picture if index < 4 else pushed(picture, 20))
+    choice = choose_frames([made.write(tmp_path / "a.mp4")], lambda size: mask)
+    assert [held(pose.frames, made.holds) for pose in choice.poses] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert len(choice.notes) == 1
+
+
+def test_a_short_rest_between_two_pushes_is_a_pose_and_a_slow_pass_is_none(tmp_path):
+    pictures, mask = views(3, SIZE, 4)
+    made = Making(SIZE, noise=1.0)
+    for pixels, seconds in ((0, 1.2), (6, 0.55), (12, 1.2)):
+        made.hold(pushed(pictures[0], pixels), seconds)
+    choice = choose_frames([made.write(tmp_path / "a.mp4")], lambda size: mask)
+    assert [held(pose.frames, made.holds) for pose in choice.poses] == [[0], [1], [2]]
+    blank = np.full((*SIZE, 3), 120.0) + cv2.resize(np.random.default_rng(0).uniform(-12, 12, (6, 8, 1)), SIZE[::-1])[..., None]
+    passing = Making(SIZE, noise=0.5)
+    passing.hold(blank, 1.2)
+    for frame in range(30):
+        passing.add(pushed(blank, 8 + min(max(frame - 9, 0), 9) * 0.25))
+    choice = choose_frames([passing.write(tmp_path / "b.mp4")])
+    print(choice)
+
+
 def test_drifting_light_is_no_new_observation_and_no_motion(tmp_path):
     pictures, _ = views(4, SIZE, 1)
     made = Making(SIZE, drift=-0.05)

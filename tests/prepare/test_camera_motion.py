@@ -45,7 +45,9 @@ def test_a_mirror_over_half_of_the_picture_neither_hides_a_push_nor_makes_one(pi
     mirror = np.zeros(SIZE, bool)
     mirror[30:220, 60:290] = True  # 57 % of the picture; where it is, is not told
     for seed in range(6):
-        first, second = (np.where(mirror[..., None], scene(500 + 2 * seed + k, SIZE), scene(seed, SIZE)) for k in (0, 1))
+        first, second = (
+            np.where(mirror[..., None], scene(500 + 2 * seed + k, SIZE), scene(seed, SIZE)) for k in (0, 1)
+        )
         motion = Anchor(noisy(first, seed)).motion(noisy(pushed(second.astype(np.float32), pixels), seed + 50))
         assert np.allclose(motion.matrix[:2, 2], [0.8 * pixels, 0.6 * pixels], atol=0.8)
         assert abs(motion.pixels - pixels) < 0.6

@@ -2,6 +2,7 @@
 
 import re
 
+import cv2
 import numpy as np
 import pytest
 from helpers.clips import Making, pushed, views
@@ -95,13 +96,15 @@ def test_a_short_rest_between_two_pushes_is_a_pose_and_a_slow_pass_is_none(tmp_p
         made.hold(pushed(pictures[0], pixels), seconds)
     choice = choose_frames([made.write(tmp_path / "a.mp4")], lambda size: mask)
     assert [held(pose.frames, made.holds) for pose in choice.poses] == [[0], [1], [2]]
-    blank = np.full((*SIZE, 3), 120.0) + cv2.resize(np.random.default_rng(0).uniform(-12, 12, (6, 8, 1)), SIZE[::-1])[..., None]
+    soft = cv2.GaussianBlur(pictures[0], (0, 0), 6.0).astype(np.float32) * 0.6 + 50
     passing = Making(SIZE, noise=0.5)
-    passing.hold(blank, 1.2)
-    for frame in range(30):
-        passing.add(pushed(blank, 8 + min(max(frame - 9, 0), 9) * 0.25))
-    choice = choose_frames([passing.write(tmp_path / "b.mp4")])
-    print(choice)
+    passing.hold(soft, 1.2)
+    for frame in range(8):
+        passing.add(pushed(soft, 8 + 0.2 * frame))
+    passing.hold(pushed(soft, 20), 1.2)
+    choice = choose_frames([passing.write(tmp_path / "b.avi", "MJPG")], lambda size: mask)
+    assert [held(pose.frames, passing.holds) for pose in choice.poses] == [[0], [1]]
+    assert "left out: a moment at" in choice.notes[0] and "alone in its pose" in choice.notes[0]
 
 
 def test_drifting_light_is_no_new_observation_and_no_motion(tmp_path):

@@ -22,6 +22,7 @@ CLEARLY = 0.5  # from which no other start is tried
 SURE = 3.0  # times its own expected error, by which a motion exceeds 0
 STILL_PRIOR = 1e-4  # of the whole gradient energy: directions in which nothing can be seen stay at 0
 PEAKS, STARTS = 8, 2  # of the phase correlation that are looked at, and that are starts
+PEAK_WIDTH = 1.2  # pixels by which a small turn or zoom smears a peak
 
 
 @dataclass(frozen=True)
@@ -159,30 +160,30 @@ class Anchor:
         starts = [np.zeros(4), coarse.fit(near, np.zeros(4), STEPS).shift * COARSE]
         fit = max((fine.fit(there, start, STEPS) for start in starts), key=_explained)
         if fit.explained < CLEARLY:  # a large motion, or a large target
-            others = [coarse.fit(near, start, STEPS).shift * COARSE for start in self._starts(near)]
-            fit = max([fit, *(fine.fit(there, start, STEPS) for start in others)], key=_explained)
+            others = (fine.fit(there, start, STEPS) for start in self._starts(there))
+            fit = max([fit, *others], key=_explained)
         fit = max([fit, fine.fit(there, fit.shift, STEPS, near=True)], key=_explained)
         if not np.isfinite(fit.shift).all() or fit.explained < EXPLAINED:
             return None
         return self._whole(fit)
 
     def _starts(self, there: np.ndarray) -> list[np.ndarray]:
-        """Motions of which there is a sign, in coarse pixels.
+        """Shifts of which there is a sign.
 
-        A target that shows something else can have a stronger peak than the camera's motion, so each is tried.
+        A target that shows something else can have a stronger peak than the camera's motion, so several are tried, and
+        at the fine resolution, where chance has weaker peaks.
         """
-        coarse = self.levels[0]
-        window = cv2.createHanningWindow(there.shape[::-1], cv2.CV_32F)
-        product = np.conj(np.fft.rfft2(coarse.image * coarse.usable * window)) * np.fft.rfft2(there * window)
+        fine = self.levels[1]
+        window = np.outer(*(_taper(side) for side in there.shape))
+        product = np.conj(np.fft.rfft2(fine.image * fine.usable * window)) * np.fft.rfft2(there * window)
         peaks = np.fft.irfft2(product / (np.abs(product) + 1e-9), there.shape).astype(np.float32)
-        peaks = cv2.GaussianBlur(np.fft.fftshift(peaks), (0, 0), 0.7)
+        peaks = cv2.GaussianBlur(np.fft.fftshift(peaks), (0, 0), PEAK_WIDTH)
         shifts = []
         for _ in range(PEAKS):
             y, x = np.unravel_index(int(np.argmax(peaks)), peaks.shape)
-            peaks[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] = -np.inf
-            shift = np.array([x - there.shape[1] // 2, y - there.shape[0] // 2, 0, 0], float)
-            shifts.append(shift)
-        tried = sorted((coarse.fit(there, shift, 2) for shift in shifts), key=_explained, reverse=True)
+            peaks[max(y - COARSE, 0) : y + COARSE + 1, max(x - COARSE, 0) : x + COARSE + 1] = -np.inf
+            shifts.append(np.array([x - there.shape[1] // 2, y - there.shape[0] // 2, 0, 0], float))
+        tried = sorted((fine.fit(there, shift, 1) for shift in shifts), key=_explained, reverse=True)
         return [fit.shift for fit in tried[:STARTS]]
 
     def _whole(self, fit: _Fit) -> Motion:
@@ -204,6 +205,11 @@ class Anchor:
 def _structure(gray: np.ndarray) -> np.ndarray:
     # With the target: what it shows is another motion at most, and its mask's edge would not move with the camera.
     return normalize_contrast(gray, np.ones(gray.shape, bool))
+
+
+def _taper(count: int) -> np.ndarray:
+    """(count,) 1, and less in the outer eighths: what lies around a large target must count."""
+    return np.minimum(1, (0.5 + np.minimum(np.arange(count), np.arange(count)[::-1])) * 8 / count).astype(np.float32)
 
 
 def _quarter(image: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ OTHER_SHARE, OTHER_CELLS = 0.02, 3  # of the target's cells that differ between 
 FOREIGN_CELLS = 0.004  # share of the cells outside the target that may differ from the other moments'
 MOVED = 0.0008  # mean motion over the diagonal, above which the camera was moved; at least a pixel
 LONE = 0.6  # seconds of stillness from which a pose with a single view is a group of its own, whatever moves in it
-RESTS = 0.4  # of what counts as moved: a camera that moves less within a brief moment stands still in it
+RESTS = 0.1  # of what counts as moved: a camera that moves less within a brief moment stands still in it
 REFERENCE_NEAR = 1.0  # seconds from the time that is stated to the still moment that it means
 
 
@@ -272,7 +272,8 @@ class _Scene:
         found = _Found(clip, moment.best, moment.start, moment.end)
         if found.lasted < LONE:
             passed = Anchor(moment.first).motion(moment.last)
-            found.rests = passed is not None and passed.pixels <= RESTS * self.moved
+            seen = passed is not None and SURE * passed.error < self.moved
+            found.rests = seen and passed.pixels <= max(RESTS * self.moved, SURE * passed.error)
         if not self.stands:
             self._stand(np.eye(3), moment.pixels)
         else:

@@ -74,14 +74,11 @@ class _Level:
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
         return np.column_stack([linear, middle + shift[:2] - linear @ middle])
 
-    def fit(self, there: np.ndarray, shift: np.ndarray, steps: int, near: bool = False) -> _Fit:
-        """The motion to the frame's structure `there`: of those on the way from `shift` on, what explains most of it.
-
-        `near` the motion, tiles that do not correlate show something else, and no longer pull.
-        """
+    def fit(self, there: np.ndarray, shift: np.ndarray, steps: int) -> _Fit:
+        """The motion to the frame's structure `there`: of those on the way from `shift`, what explains most."""
         best = None
         for _ in range(steps):
-            found, step = self._look(there, shift, near)
+            found, step = self._look(there, shift)
             if best is None or found.explained > best.explained:
                 best = found
             if np.abs(step).max() < SETTLED:
@@ -89,19 +86,16 @@ class _Level:
             shift = shift + np.clip(step, -MAX_STEP, MAX_STEP)
         return best
 
-    def _look(self, there: np.ndarray, shift: np.ndarray, near: bool) -> tuple[_Fit, np.ndarray]:
+    def _look(self, there: np.ndarray, shift: np.ndarray) -> tuple[_Fit, np.ndarray]:
         """What is to be said of a motion, and the step to a better one."""
         gradients, pulls, weights, correlation, overlap = self._tiles(there, shift)
-        agreeing = np.square(np.clip(correlation, 0, 1))
-        if near:
-            weights = weights * np.square(agreeing / max(agreeing.max(), 1e-9))
         normal = np.einsum("t,tji,tjk,tkl->il", weights, self.geometry, gradients, self.geometry)
         normal += (STILL_PRIOR * np.trace(gradients.sum(axis=0)) + 1e-9) * np.eye(4)
         # Its error by how the tiles disagree, not by the residuals' variance: neighboring residuals are alike.
         scores = np.einsum("t,tji,tj->ti", weights, self.geometry, pulls)
         inverse = np.linalg.inv(normal)
         energy = gradients[:, 0, 0] + gradients[:, 1, 1]
-        explained = overlap * float((energy * agreeing).sum() / max(energy.sum(), 1e-9))
+        explained = overlap * float((energy * np.square(np.clip(correlation, 0, 1))).sum() / max(energy.sum(), 1e-9))
         return _Fit(shift, inverse @ (scores.T @ scores) @ inverse, explained), inverse @ scores.sum(axis=0)
 
     def _tiles(self, there: np.ndarray, shift: np.ndarray):
@@ -157,18 +151,18 @@ class Anchor:
         there = _structure(self._small(pixels))
         coarse, fine = self.levels
         near = _quarter(there)
-        starts = [np.zeros(4), coarse.fit(near, np.zeros(4), STEPS).shift * COARSE]
+        roughly = coarse.fit(near, np.zeros(4), STEPS).shift * COARSE
+        starts = [roughly, np.zeros(4)] if np.abs(roughly).max() > 1 else [roughly]
         fit = max((fine.fit(there, start, STEPS) for start in starts), key=_explained)
         if fit.explained < CLEARLY:  # a large motion, or a large target
-            others = (fine.fit(there, start, STEPS) for start in self._starts(there))
-            fit = max([fit, *others], key=_explained)
-        fit = max([fit, fine.fit(there, fit.shift, STEPS, near=True)], key=_explained)
+            others = [start for start in self._starts(there) if 2 * start.explained > fit.explained]
+            fit = max([fit, *(fine.fit(there, start.shift, STEPS) for start in others)], key=_explained)
         if not np.isfinite(fit.shift).all() or fit.explained < EXPLAINED:
             return None
         return self._whole(fit)
 
-    def _starts(self, there: np.ndarray) -> list[np.ndarray]:
-        """Shifts of which there is a sign.
+    def _starts(self, there: np.ndarray) -> list[_Fit]:
+        """Shifts of which there is a sign, the best first.
 
         A target that shows something else can have a stronger peak than the camera's motion, so several are tried, and
         at the fine resolution, where chance has weaker peaks.
@@ -183,8 +177,7 @@ class Anchor:
             y, x = np.unravel_index(int(np.argmax(peaks)), peaks.shape)
             peaks[max(y - COARSE, 0) : y + COARSE + 1, max(x - COARSE, 0) : x + COARSE + 1] = -np.inf
             shifts.append(np.array([x - there.shape[1] // 2, y - there.shape[0] // 2, 0, 0], float))
-        tried = sorted((fine.fit(there, shift, 1) for shift in shifts), key=_explained, reverse=True)
-        return [fit.shift for fit in tried[:STARTS]]
+        return sorted((fine.fit(there, shift, 1) for shift in shifts), key=_explained, reverse=True)[:STARTS]
 
     def _whole(self, fit: _Fit) -> Motion:
         """In pixels of the frame."""

@@ -127,6 +127,17 @@ def test_drifting_light_is_no_new_observation_and_no_motion(tmp_path):
     assert len(choice.poses) == 1 and len(choice.poses[0].frames) == 1
 
 
+def test_what_the_drifting_light_clips_stands_not_outside_the_target(tmp_path):
+    pictures, mask = views(2, SIZE, 4)
+    made = Making(SIZE, noise=1.0, drift=0.03)
+    for picture in pictures:
+        lamp = np.where(mask[..., None], picture, np.clip(0.8 * picture, 0, 200))
+        lamp[:60, :80] = np.where(mask[:60, :80, None], lamp[:60, :80], 225)
+        made.hold(lamp, 2.0)
+    choice = choose_frames([made.write(tmp_path / "a.mp4")], lambda size: mask)
+    assert held(choice.poses[0].frames, made.holds) == [0, 1, 2, 3] and choice.notes == []
+
+
 def test_the_most_different_are_taken_where_there_are_many(tmp_path):
     pictures, mask = views(5, SIZE, 5)
     nearly = np.where(mask[..., None], 0.9 * pictures[0] + 0.1 * pictures[1], pictures[0])

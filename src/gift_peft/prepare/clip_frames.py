@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gift_peft.captures.clip import Clip, ClipFrame, TimeInClip
@@ -27,6 +28,7 @@ from gift_peft.prepare.stillness import (
 MOST_LOOKS = 48  # moments of one pose that are remembered; of the two most alike one goes
 OTHER_SHARE, OTHER_CELLS = 0.02, 3  # of the target's cells that differ between two observations at least
 FOREIGN_CELLS = 0.004  # share of the cells outside the target that may differ from the other moments'
+WHITE = 230  # grey levels of a cell, part of which may be clipped
 MOVED = 0.0008  # mean motion over the diagonal, above which the camera was moved; at least a pixel
 LONE = 0.6  # seconds of stillness from which a pose with a single view is a group of its own, whatever moves in it
 RESTS = 0.1  # of what counts as moved: a camera that moves less within a brief moment stands still in it
@@ -246,8 +248,11 @@ class _Stand:
         limit = max(OTHER_CELLS, FOREIGN_CELLS * self.outside.sum())
         kept, notes = [], []
         for found in moments:
-            foreign = difference(found.look.cells, usual, self.outside)[self.outside] > 3 * threshold
-            if foreign.sum() <= limit:
+            foreign = difference(found.look.cells, usual, self.outside) > 3 * threshold
+            # What is nearly white in both says nothing: the light that drifts has clipped it in one of them.
+            white = np.minimum(found.look.cells, usual).max(axis=2) > WHITE
+            told = self.outside & (cv2.dilate(white.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+            if foreign[told].sum() <= limit:
                 kept.append(found)
             else:
                 notes.append(f"left out: at {found.look.seconds:.1f} s something stands outside the target")

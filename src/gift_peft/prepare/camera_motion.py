@@ -2,7 +2,8 @@
 
 Direct alignment in place of tracked corners, which soft and noisy frames hardly have: Gauss-Newton over all pixels, on
 brightness freed of local mean and contrast. Residuals are judged by tiles, and tiles that show something else than the
-rest agrees on lose their weight, so that a target that changes does not pull, known or not.
+rest agrees on lose their weight, so that a target that changes does not pull, known or not. Of several starts that one
+wins whose motion explains most of the picture, so that a mirror over half of it neither hides a motion nor makes one.
 """
 
 from dataclasses import dataclass

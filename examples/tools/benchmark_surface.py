@@ -3,8 +3,9 @@
     OMP_NUM_THREADS=2 python examples/tools/benchmark_surface.py --out docs
 
 The same images of the embedded dataset in one run, in turn within each repeat: (b) the paper's schedule, `--retain 0`
-with micro-batches of 2; (d) what `gift-peft train` does; (e) `--target surface`, batches of 4 images of any groups.
-(d) and (e) take as many images per forward as memory allows.
+with micro-batches of 2, the head in PyTorch's own layout; (c) the same, the head channels-last; (d) what `gift-peft
+train` does; (e) `--target surface`, batches of 4 images of any groups. (d) and (e) have their defaults: the head
+channels-last and as many images per forward as memory allows.
 Then what the targets cost once, with and without fills, in epochs of (e), and the memory of one update.
 """
 
@@ -28,17 +29,22 @@ from gift_peft.dataset.writer import write_gift_i
 from gift_peft.group_inputs import GroupInputs
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.training import profiling
-from gift_peft.training.speed import make_adam
+from gift_peft.training.speed import channels_last_head, make_adam
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 from gift_peft.training.teacher import make_proxies
 
 SIZE, BATCH = (112, 140), 4
 TITLE = "Surface targets beside groups"
-NAMES = {"b": "paper's schedule", "d": "gift-peft default, consensus", "e": "surface targets"}
+NAMES = {
+    "b": "paper's schedule",
+    "c": "paper's schedule, channels-last",
+    "d": "gift-peft default, consensus",
+    "e": "surface targets",
+}
 
 
 class Epochs:
-    """The three ways to go once through the same images."""
+    """The ways to go once through the same images."""
 
     def __init__(self, base: Path, groups: list) -> None:
         network, processor = load_base(base)
@@ -53,6 +59,7 @@ class Epochs:
         self.images = [torch.cat(parts) for parts in zip(*self.groups, strict=True)]
         self.steps = {
             "b": GroupStep(self.network, retain=0),
+            "c": GroupStep(self.network, retain=0),
             "d": GroupStep(self.network, micro_batch_size="auto"),
             "e": SurfaceStep(PredictedDepth(self.network)),
         }
@@ -65,7 +72,8 @@ class Epochs:
         started = time.perf_counter()
         for update in self.groups if method != "e" else zip(*(part.split(BATCH) for part in self.images), strict=True):
             self.optimizer.zero_grad(set_to_none=True)
-            self.steps[method].accumulate(*update)
+            with channels_last_head(self.network, method != "b"):
+                self.steps[method].accumulate(*update)
             self.optimizer.step()
         return time.perf_counter() - started
 
@@ -78,7 +86,8 @@ class Epochs:
             self.optimizer.zero_grad(set_to_none=True)
             before = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
             profiling.reset_peak_memory(torch.device("cpu"))
-            step.accumulate(*update)
+            with channels_last_head(self.network, method != "b"):
+                step.accumulate(*update)
             peaks[method] = profiling.peak_memory(torch.device("cpu")) - before
         return peaks
 
@@ -144,7 +153,7 @@ def measure_epochs(epochs: Epochs, repeats: int) -> dict[str, list[float]]:
     seconds: dict[str, list[float]] = {method: [] for method in epochs.steps}
     for repeat in tqdm(range(repeats + 1), "epochs", unit="repeat"):
         order = list(seconds)
-        for method in order[repeat % 3 :] + order[: repeat % 3]:
+        for method in order[repeat % len(order) :] + order[: repeat % len(order)]:
             taken = epochs(method)
             if repeat:  # the first warms up
                 seconds[method].append(taken)

@@ -18,7 +18,7 @@ from gift_peft.group_inputs import GroupInputs
 from gift_peft.group_step import GroupStep
 from gift_peft.training.precision import choose_precision, exact_output
 from gift_peft.training.profiling import peak_memory, reset_peak_memory, synchronize
-from gift_peft.training.speed import make_adam, tuned_for, use_channels_last
+from gift_peft.training.speed import channels_last_head, make_adam, tuned_for
 
 
 def noise(images: int, size: tuple[int, int], pin: bool) -> GroupInputs:
@@ -72,35 +72,34 @@ def main() -> None:
     torch.manual_seed(0)
     model = get_gift_model(CONFIGS[args.model].build()).to(device).eval()
     exact_output(model)
-    if tuned_for(device, None, "full"):
-        use_channels_last(model)
-    step = GroupStep(model, micro_batch_size="auto", accelerator=accelerator)
-    optimizer = make_adam([p for p in model.parameters() if p.requires_grad], 2e-5)
-    group = noise(args.images, size, pin=cuda)
-    reset_peak_memory(device)
-    update(step, optimizer, group)  # measures memory, tries cuDNN's algorithms out
-    update(step, optimizer, group)
-    seconds = []
-    for _ in range(args.updates):
-        synchronize(device)
-        started = time.perf_counter()
+    with channels_last_head(model, tuned_for(device, None, "full")):
+        step = GroupStep(model, micro_batch_size="auto", accelerator=accelerator)
+        optimizer = make_adam([p for p in model.parameters() if p.requires_grad], 2e-5)
+        group = noise(args.images, size, pin=cuda)
+        reset_peak_memory(device)
+        update(step, optimizer, group)  # measures memory, tries cuDNN's algorithms out
         update(step, optimizer, group)
-        synchronize(device)
-        seconds.append(time.perf_counter() - started)
-    peak = peak_memory(device)
-    total = torch.cuda.get_device_properties(device).total_memory if cuda else 0
-    replay = GroupStep(model, micro_batch_size=step.micro_batch_size, retain=0, accelerator=accelerator)
-    middle = statistics.median(seconds)
-    rows = {
-        "device, precision": f"{torch.cuda.get_device_name(device) if cuda else 'CPU'}, {step.mixed_precision}",
-        "snapshot and replay": same_bits(replay, group.pixel_values[: step.micro_batch_size]),
-        "micro-batch": str(step.micro_batch_size),
-        "budget": str(step.budget),
-        "peak": f"{peak / 2**30:.2f} GiB" + (f" of {total / 2**30:.2f}" if cuda else " (the whole process)"),
-        "waits per update": str(count_waits(step, optimizer, group)) if cuda else "not counted",
-        "seconds per update": f"{middle:.3f} ({min(seconds):.3f} to {max(seconds):.3f})",
-        "epoch of 3,268 images": f"{3268 / args.images * middle:.0f} s (extrapolated)",
-    }
+        seconds = []
+        for _ in range(args.updates):
+            synchronize(device)
+            started = time.perf_counter()
+            update(step, optimizer, group)
+            synchronize(device)
+            seconds.append(time.perf_counter() - started)
+        peak = peak_memory(device)
+        total = torch.cuda.get_device_properties(device).total_memory if cuda else 0
+        replay = GroupStep(model, micro_batch_size=step.micro_batch_size, retain=0, accelerator=accelerator)
+        middle = statistics.median(seconds)
+        rows = {
+            "device, precision": f"{torch.cuda.get_device_name(device) if cuda else 'CPU'}, {step.mixed_precision}",
+            "snapshot and replay": same_bits(replay, group.pixel_values[: step.micro_batch_size]),
+            "micro-batch": str(step.micro_batch_size),
+            "budget": str(step.budget),
+            "peak": f"{peak / 2**30:.2f} GiB" + (f" of {total / 2**30:.2f}" if cuda else " (the whole process)"),
+            "waits per update": str(count_waits(step, optimizer, group)) if cuda else "not counted",
+            "seconds per update": f"{middle:.3f} ({min(seconds):.3f} to {max(seconds):.3f})",
+            "epoch of 3,268 images": f"{3268 / args.images * middle:.0f} s (extrapolated)",
+        }
     print(f"\n| {args.model}, {args.images} images of {size[0]}x{size[1]} | |\n|---|---|")
     print("\n".join(f"| {name} | {value} |" for name, value in rows.items()), flush=True)
 

@@ -178,7 +178,7 @@ def raw(tmp_path):
 
 
 def test_readers_of_photos_refuse_a_clip_and_print_the_line_to_type(raw, base_dir, capsys):
-    line = f"gift-peft prepare {raw} raw-prepared"
+    line = f"gift-peft prepare {raw} {raw}-prepared"
     with pytest.raises(ValueError, match="holds a clip") as caught:
         load_gift_i(raw, "train")
     assert f"`{line}`" in str(caught.value)

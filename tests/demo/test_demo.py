@@ -117,29 +117,6 @@ def test_one_target_alone_is_the_demo(embedded, tmp_path, monkeypatch, capsys, t
         assert 2000 < picture.width < 2500  # four columns
 
 
-@pytest.mark.parametrize(
-    ("options", "channels_last"),
-    [
-        ([], True),
-        (["--head=lora"], False),
-        (["--channels_last=false"], False),
-        (["--channels-last", "false"], False),
-        (["--head=lora", "--channels_last"], True),  # refused by the training, which says why
-    ],
-)
-def test_the_demo_is_channels_last_where_it_can_and_may_be(embedded, tmp_path, monkeypatch, options, channels_last):
-    asked = []
-
-    def stop(args, **told):
-        asked.append(args)
-        raise InterruptedError
-
-    monkeypatch.setattr(run, "train", stop)
-    with pytest.raises(InterruptedError):
-        run.run_demo(tmp_path / "demo", extra=options)
-    assert bool(asked[0].channels_last) is channels_last
-
-
 def contents(folder):
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import weakref
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -83,8 +84,8 @@ def test_options_are_timed_with_one_model_at_a_time(modules, monkeypatch):
 
     monkeypatch.setattr(script, "get_gift_model", make)
     monkeypatch.setattr(script, "load_base", lambda base: (None, None))
-    for name in ("checkpoint_blocks", "use_channels_last"):
-        monkeypatch.setattr(script, name, lambda model: None)
+    monkeypatch.setattr(script, "checkpoint_blocks", lambda model: None)
+    monkeypatch.setattr(script, "channels_last_head", lambda model, wanted: nullcontext())
     pixels, mask, target, _ = group(3, torch.float32)
     some = SimpleNamespace(pixel_values=pixels, mask=mask, target=target)
     bench = SimpleNamespace(base="", device=torch.device("cpu"), accelerator=None, index={3: 0}, groups=[some])

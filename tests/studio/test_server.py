@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from gift_peft.studio import server
+from gift_peft.studio.compare_room import CompareRoom
 from gift_peft.studio.server import Guard, Rooms, build, check_gradio, free_port, private_folder
 
 PORT = 7860
@@ -154,3 +155,16 @@ def test_photos_reach_the_room_as_their_files_are(tmp_path):
     Image.fromarray(np.full((4, 5), 3000, np.uint16)).save(tmp_path / "deep.png")
     given = image_data(path=str(tmp_path / "deep.png"), orig_name="deep.png")
     assert [photo.preprocess(given) for photo in photos] == [given.path]
+
+
+def test_what_is_no_picture_reaches_the_room_too_which_says_so(tmp_path):
+    """gradio would decode it before, and fail with a traceback."""
+    gr = pytest.importorskip("gradio")
+    image_data = pytest.importorskip("gradio.data_classes").ImageData
+    room = SimpleNamespace(model=SimpleNamespace(adapted=True))
+    (photo,) = [one for one in build(Rooms(compare=room), "a").blocks.values() if isinstance(one, gr.Image)]
+    (tmp_path / "notes.png").write_text("notes")
+    given = image_data(path=str(tmp_path / "notes.png"), orig_name="notes.png")
+    assert photo.preprocess(given) == given.path and photo.preprocess(None) is None
+    with pytest.raises(ValueError, match=r"notes\.png: not a readable image"):
+        CompareRoom.compare(room, photo.preprocess(given), 1.0)

@@ -4,20 +4,16 @@ Nothing is asked of any other address, and the browser has nothing to complain a
 """
 
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
 import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager
 
 import cv2
 import numpy as np
 import pytest
+from helpers.browser_tabs import Watched, needs_chromium, studio
 from helpers.exports import write_adapter
 from helpers.photos import capture, motion
 from helpers.tiny import SIZE, tiny_model, tiny_processor, write_raw_tree
@@ -30,73 +26,12 @@ from gift_peft.studio.group_view import look_at
 from gift_peft.studio.server import PAGE
 from gift_peft.training.teacher import make_proxies
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here"),
+    needs_chromium,
     pytest.mark.filterwarnings("ignore:the base is the local folder", "ignore::DeprecationWarning"),
 ]
-WAIT = 120_000  # milliseconds: others may use the cores as well
 PHOTOS = 10
-
-
-@contextmanager
-def studio(*words):
-    """The address of a studio at work; at its end it has left no temporary folder."""
-    settings = {"HF_HUB_OFFLINE": "1", "PYTHONUNBUFFERED": "1", "GRADIO_SHARE": "True", "GRADIO_ALLOWED_PATHS": "/"}
-    command = [sys.executable, "-m", "gift_peft", "studio", "--port", "0", *map(str, words)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    server = subprocess.Popen(command, text=True, env=os.environ | settings, **pipes)
-    try:
-        line = server.stdout.readline()
-        yield re.search(r"http://127\.0\.0\.1:\d+", line).group()
-    finally:
-        server.send_signal(signal.SIGINT)
-        told = server.communicate(timeout=60)[1]
-    assert server.returncode == 0 and "Traceback" not in told and told.startswith("Opening the studio"), told
-
-
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as tool:
-        made = tool.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        yield made
-        made.close()
-
-
-class Watched:
-    """A tab, and what it asked for and complained about."""
-
-    def __init__(self, browser, url, width=1280):
-        self.page, self.url, self.asked, self.wrong = (
-            browser.new_page(viewport={"width": width, "height": 900}),
-            url,
-            [],
-            [],
-        )
-        self.page.set_default_timeout(WAIT)
-        self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
-        self.page.on("console", lambda message: message.type == "error" and self.wrong.append(message.text))
-        self.page.goto(url)
-
-    def said(self, pattern):
-        """Wait until the room says what matches."""
-        script = "pattern => new RegExp(pattern).test(document.querySelector('#masks .said')?.textContent)"
-        self.page.wait_for_function(script, arg=pattern)
-        return self.page.locator("#masks .said").text_content()
-
-    def click(self, place, **options):
-        canvas = self.page.locator("#masks canvas")
-        canvas.scroll_into_view_if_needed()
-        box = canvas.bounding_box()
-        self.page.mouse.click(box["x"] + place[0] * box["width"], box["y"] + place[1] * box["height"], **options)
-
-    def close(self):
-        elsewhere = [url for url in self.asked if not url.startswith((f"{self.url}/", "data:", "blob:"))]
-        assert not elsewhere and not self.wrong, (elsewhere, self.wrong)
-        self.page.close()
 
 
 def middle(mask):

@@ -7,6 +7,7 @@ import pytest
 from helpers.tiny import write_group
 
 from gift_peft.cli import main
+from gift_peft.prepare import proposals
 from gift_peft.studio import server, studio_verb
 from gift_peft.studio.studio_verb import kind_of
 
@@ -63,7 +64,11 @@ def test_what_is_missing_is_told_in_a_line(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "words", [[], ["a", "b"], ["a", "--port=-1"], ["a", "--port", "x"], ["a", "--adapter-scale=1"]]
+    "words",
+    [
+        *([], ["a", "b"], ["a", "--port=-1"], ["a", "--port", "x"], ["a", "--adapter-scale=1"], ["a", "--mask=m.png"]),
+        [str(PREPARED), "--refine=sam2:x"],
+    ],
 )
 def test_wrong_usage_is_2(words, capsys):
     with pytest.raises(SystemExit) as ended:
@@ -84,7 +89,8 @@ def opened(monkeypatch, tmp_path):
 
 
 def test_each_folder_opens_its_rooms(opened, tmp_path, capsys, monkeypatch):
-    models = []
+    models, refiners = [], []
+    monkeypatch.setattr(proposals, "load_sam2", refiners.append)
     monkeypatch.setattr(studio_verb, "_compare", lambda args, adapter, temporary: models.append(adapter) or "compare")
     write_group(tmp_path / "raw" / "hall", 2, 0)
     (tmp_path / "run" / "adapter").mkdir(parents=True)
@@ -109,8 +115,63 @@ def test_each_folder_opens_its_rooms(opened, tmp_path, capsys, monkeypatch):
         (False, False, True),
     ]
     assert models == ["a", tmp_path / "run" / "adapter", tmp_path / "run" / "adapter", None]
-    assert opened[1].masks.method == "sam2:x"
+    assert opened[1].masks.method == "sam2:x" and refiners == ["sam2:x"]
     capsys.readouterr()
     with pytest.raises(SystemExit):
         main(["studio", "--port=0", str(PREPARED)])
     assert "gift-peft proxies --base BASE" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [("grabcut", "refine 'grabcut': write sam2:<model id>"), ("sam2:{here}/nothing", "the model cannot be loaded")],
+)
+def test_what_cannot_refine_is_told_before_it_serves(opened, tmp_path, capsys, method, message):
+    write_group(tmp_path / "raw" / "hall", 2, 0)
+    with pytest.raises(SystemExit) as ended:
+        main(["studio", "--port=0", str(tmp_path / "raw"), "--refine", method.format(here=tmp_path)])
+    assert ended.value.code == 1 and not opened
+    assert message in capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_a_source_opens_the_capture_room_in_raw_or_a_new_folder(opened, tmp_path, capsys, monkeypatch):
+    write_group(tmp_path / "raw" / "hall", 2, 0)
+    write_group(tmp_path / "split" / "train" / "hall", 2, 0)
+    (tmp_path / "empty").mkdir()
+    for name in ("raw", "split", "empty", "new"):
+        with pytest.raises(SystemExit) as ended:
+            main(["studio", "--port=0", str(tmp_path / name), "--source", "0"])
+        assert ended.value.code == 0
+        assert opened[-1].capture.source.device == 0 and opened[-1].masks.root == tmp_path / name
+    assert not (tmp_path / "new").exists()
+    monkeypatch.setattr(opened[-1].capture.__class__, "close", lambda room: ["door: 3 photos"])
+    with pytest.raises(SystemExit):
+        main(["studio", "--port=0", str(tmp_path / "new"), "--source", "0"])
+    assert capsys.readouterr().out == "door: 3 photos\n"
+    with pytest.raises(ValueError, match="has no groups yet: take photos"):
+        opened[-1].masks.groups()
+    with pytest.raises(SystemExit) as ended:
+        main(["studio", "--port=0", str(tmp_path / "raw")])
+    assert ended.value.code == 0 and opened[-1].capture is None
+
+
+@pytest.mark.parametrize(
+    ("folder", "words", "message"),
+    [
+        ("notes", ["--source", "0"], "holds something else than groups of photos"),
+        (PREPARED, ["--source", "0"], "prepared folder"),
+        ("new", ["--source", "nowhere.mp4"], "nowhere.mp4: no such file"),
+        ("new", ["--source", "nowhere"], "nowhere: neither a camera's number"),
+        ("new", ["--source", "0", "--mask", "m.png"], "m.png"),
+    ],
+)
+def test_where_no_photos_can_be_taken_is_told_at_the_start(
+    opened, tmp_path, capsys, monkeypatch, folder, words, message
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").write_text("mine")
+    with pytest.raises(SystemExit) as ended:
+        main(["studio", "--port=0", str(folder), *words])
+    assert ended.value.code == 1 and not opened
+    assert message in capsys.readouterr().err.strip().splitlines()[-1]

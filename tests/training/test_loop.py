@@ -256,9 +256,12 @@ def test_recomputed_blocks_and_retained_graphs_do_not_change_a_bit(base_dir, tre
 def test_an_option_that_changes_the_bits_is_near_and_may_not_be_changed_on_the_way(base_dir, tree, tmp_path):
     args = arguments(base_dir, tree, tmp_path / "out", max_steps=2, channels_last=True)
     train(args)
-    train(arguments(base_dir, tree, tmp_path / "plain", max_steps=2))
+    other = arguments(base_dir, tree, tmp_path / "plain", max_steps=2, channels_last=False)
+    train(other)
     got, plain = weights(tmp_path / "out/adapter-last"), weights(tmp_path / "plain/adapter-last")
     for key in plain:
         torch.testing.assert_close(got[key], plain[key], rtol=0, atol=2.5 * 2 * args.learning_rate)  # Adam's signs
     with pytest.raises(ValueError, match="channels_last: True became False"):
         train_again(args, channels_last=False, max_steps=3)
+    train_again(other, channels_last=None, max_steps=3)  # unless asked, a run keeps what it began with
+    assert "channels_last: false" in (tmp_path / "plain/config.yaml").read_text()

@@ -10,12 +10,12 @@ from torch import nn
 from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.memory import graph_bytes, is_compiled
 from gift_peft.training.speed import (
+    channels_last_head,
     checkpoint_blocks,
     compile_blocks,
     encoder_blocks,
     make_adam,
     tuned_for,
-    use_channels_last,
 )
 
 
@@ -59,29 +59,43 @@ def test_channels_last_changes_the_trained_head_only():
     _, want = step_gradients(model, 2, 0, data)
     with torch.no_grad(), model.disable_adapter():
         teacher = model(pixel_values=data[0]).predicted_depth
-    use_channels_last(model)
     formats = []
     head = model.get_base_model().head.modules_to_save["default"]
     head.conv1.register_forward_hook(
         lambda module, args, output: formats.append(args[0].is_contiguous(memory_format=torch.channels_last))
     )
-    _, got = step_gradients(model, 2, 0, data)
+    with channels_last_head(model):
+        _, got = step_gradients(model, 2, 0, data)
+        with torch.no_grad(), model.disable_adapter():
+            assert torch.equal(model(pixel_values=data[0]).predicted_depth, teacher)
     assert formats and all(formats)
     assert relative_l2(got, want) < 1e-3
     assert all(got[name].is_contiguous() for name in got)
-    with torch.no_grad(), model.disable_adapter():
-        assert torch.equal(model(pixel_values=data[0]).predicted_depth, teacher)
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_channels_last_leaves_nothing_behind(wanted):
+    data = group(3, torch.float32)
+    model = gift_model(torch.float32)
+    _, before = step_gradients(model, 2, 0, data)
+    with pytest.raises(RuntimeError, match="stop"), channels_last_head(model, wanted):
+        raise RuntimeError("stop")
+    _, after = step_gradients(model, 2, 0, data)
+    assert largest_error(after, before) == 0
+    assert not any(module._forward_pre_hooks for module in model.modules())
 
 
 @pytest.mark.parametrize(
     ("device", "asked", "head", "expected"),
     [
-        ("cpu", None, "full", False),
+        ("cpu", None, "full", True),
+        ("cpu", None, "lora", False),
+        ("cpu", False, "full", False),
+        ("mps", None, "full", False),
         ("cpu", True, "full", True),
         ("cuda", None, "full", True),
         ("cuda", None, "lora", False),
         ("cuda", False, "full", False),
-        ("cuda", True, "lora", True),  # refused when the model is made
     ],
 )
 def test_channels_last_by_device(device, asked, head, expected, monkeypatch):
@@ -91,8 +105,10 @@ def test_channels_last_by_device(device, asked, head, expected, monkeypatch):
 
 
 def test_channels_last_wants_a_head_that_is_trained(model):
+    with pytest.raises(ValueError, match="head: full"), channels_last_head(get_gift_model(model, head="lora")):
+        pass
     with pytest.raises(ValueError, match="head: full"):
-        use_channels_last(get_gift_model(model, head="lora"))
+        tuned_for(torch.device("cpu"), True, "lora")
 
 
 def test_adam_is_pytorchs_in_one_kernel():

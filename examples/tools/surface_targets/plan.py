@@ -23,7 +23,11 @@ class Rule:
 
 @dataclass(frozen=True)
 class Trial:
-    """One training. `rule` None is the paper's objective; `train` and `score` are (set, `part`) pairs."""
+    """One training. `rule` None is the paper's objective; `train` and `score` are (set, `part`) pairs.
+
+    `jitter` is the largest relative change of brightness, contrast and, a third of it, of each color's share, drawn
+    anew for each photo of an update.
+    """
 
     name: str
     train: tuple[tuple[str, str | int], ...]
@@ -37,6 +41,7 @@ class Trial:
     updates: int = 0
     batch: int = 4
     flips: bool = True
+    jitter: float = 0.0
 
     def describe(self) -> dict:
         return asdict(self)
@@ -54,7 +59,9 @@ def part(groups: list[Observed], which: str | int) -> list[Observed]:
 TRAIN = (("train", "all"),)
 OLD = (("validation", "all"),)
 BOTH = (*TRAIN, ("singles", 318))
+MANY = (*TRAIN, ("singles", 1000))
 FRESH = (("fresh_1", "all"), ("fresh_2", "all"), ("fresh_3", "all"))
+UNSEEN = (("fresh_4", "all"), ("fresh_5", "all"), ("fresh_6", "all"))  # rendered after FRESH had been looked at
 
 
 def first(name: str, **options) -> Trial:
@@ -87,6 +94,11 @@ STAGES = {
         first("auto without fills lambda_c 1.2 8 epochs", rule=Rule(fills=0, **HIGH), lambda_c=1.2, epochs=8),
         first("consensus", **PAPER),
         first("consensus 8 epochs", **PAPER, epochs=8),
+    ],
+    "levers": [
+        first("groups alone", **CHOSEN),
+        first("groups, colors changed", jitter=0.3, **CHOSEN),
+        first("groups, lambda_d 1.8", **CHOSEN | {"lambda_d": 1.8}),
     ],
     "main": [report("surface targets"), report("paper's objective", **PAPER)],
     "controls": [
@@ -121,6 +133,13 @@ STAGES = {
     "more": [
         report("surface targets, 24 epochs", epochs=24),
         Trial("groups and 318 single photos, 18 epochs", BOTH, FRESH, **CHOSEN | {"epochs": 18}),
+    ],
+    # Four times the scenes, on sets that nothing had been scored on; the older validation groups choose.
+    "many": [
+        Trial("groups and 1000 single photos", MANY, (*OLD, *UNSEEN, *FRESH), **CHOSEN),
+        Trial("groups and 1000 single photos, calm", MANY, (*OLD, *UNSEEN, *FRESH), lambda_c=1.0, epochs=8),
+        Trial("groups alone", TRAIN, (*OLD, *UNSEEN), **CHOSEN),
+        Trial("paper's objective, groups alone", TRAIN, (*OLD, *UNSEEN), **CHOSEN | PAPER),
     ],
     # The paper's objective over the grid, on the older validation groups.
     "paper's grid": [

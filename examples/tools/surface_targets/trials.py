@@ -26,9 +26,10 @@ from gift_peft.dataset.loader import epoch_flips, epoch_order
 from gift_peft.evaluation.alignment import align
 from gift_peft.models.loading import DepthModel, load_base
 from gift_peft.surface_targets import surface_target
-from gift_peft.training.speed import use_channels_last
+from gift_peft.training.speed import channels_last_head
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the embedded base's processor
 BASE = Path(__file__).resolve().parents[3] / "src" / "gift_peft" / "demo" / "base"
 
 
@@ -82,7 +83,6 @@ def train(trial: plan.Trial, groups: list[Observed], seed: int, store: Path):
     base, processor = load_base(BASE)
     torch.manual_seed(seed)
     network = get_gift_model(base).eval()
-    use_channels_last(network)
     parameters = [p for p in network.parameters() if p.requires_grad]
     optimizer = torch.optim.Adam(parameters, lr=trial.rate)
     helper = DepthModel(network, processor, SIZE)
@@ -93,10 +93,11 @@ def train(trial: plan.Trial, groups: list[Observed], seed: int, store: Path):
     else:
         update, feed, epoch = _surface(network, trial, groups, inputs, seed, store)
     total = trial.updates or trial.epochs * epoch
-    for number, item in zip(tqdm(range(total), trial.name, mininterval=20), feed, strict=False):
-        optimizer.param_groups[0]["lr"] = trial.rate * (1 - number / total)
-        update(item)
-        optimizer.step()
+    with channels_last_head(network):
+        for number, item in zip(tqdm(range(total), trial.name, mininterval=20), feed, strict=False):
+            optimizer.param_groups[0]["lr"] = trial.rate * (1 - number / total)
+            update(item)
+            optimizer.step()
     return helper, time.perf_counter() - began
 
 
@@ -131,6 +132,7 @@ def _surface(network, trial, groups, inputs, seed, store):
     step = SurfaceStep(PredictedDepth(network), trial.lambda_c, trial.lambda_d, 4)
     places = [(row, image) for row, group in enumerate(groups) for image in range(len(group.images))]
     both = [False, True] if trial.flips else [False]
+    generator = torch.Generator().manual_seed(seed)
     maps = {flip: kept_maps(store, groups, trial.rule, flip) for flip in both}
 
     def feed():
@@ -146,9 +148,21 @@ def _surface(network, trial, groups, inputs, seed, store):
             pixels.append(one.flip(-1) if flip else one)
             masks.append(mask.flip(-1) if flip else mask)
             wanted.append(maps[flip][row][image])
-        step.accumulate(torch.stack(pixels), torch.stack(masks), torch.stack(wanted))
+        changed = jittered(torch.stack(pixels), trial.jitter, generator)
+        step.accumulate(changed, torch.stack(masks), torch.stack(wanted))
 
     return update, feed(), -(-len(places) // trial.batch)
+
+
+def jittered(pixels: torch.Tensor, amount: float, generator: torch.Generator) -> torch.Tensor:
+    """Normalized photos (n,3,h,w) in other light."""
+    if not amount:
+        return pixels
+    mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
+    drawn = 1 + amount * (2 * torch.rand(len(pixels), 5, 1, 1, generator=generator) - 1)
+    colors = (pixels * std + mean) * drawn[:, :1] * (1 + (drawn[:, 2:] - 1) / 3)
+    middle = colors.mean((1, 2, 3), keepdim=True)
+    return ((middle + (colors - middle) * drawn[:, 1:2]).clamp(0, 1) - mean) / std
 
 
 def choose(groups: list[Observed], photos: str) -> list[Observed]:

@@ -146,8 +146,15 @@ def find_clips(files: Iterable[Path]) -> list[Path]:
 def explain_clip(folder: Path, clips: list[Path], root: Path) -> str:
     """Why a group of clips is not read as photos, and the line to type."""
     names = ", ".join(path.name for path in clips)
-    line = shlex.join(["gift-peft", "prepare", str(root), f"{root.resolve().name}-prepared"])
+    line = prepare_line(root)
     return f"group {folder} holds a clip ({names}) and no photos; choose its frames with `{line}`, and use that folder"
+
+
+def prepare_line(root: Path) -> str:
+    """The command that prepares a raw tree, to type: into a folder beside it, since OUT may not lie inside."""
+    plain = root.name not in ("", "..")
+    out = root.with_name(f"{root.name}-prepared") if plain else root / ".." / f"{root.resolve().name}-prepared"
+    return shlex.join(["gift-peft", "prepare", str(root), str(out)])
 
 
 def read_time(value: Any, at: str) -> TimeInClip:

@@ -116,8 +116,6 @@ def _arguments(
     if overwrite:
         own.append("--overwrite_output_dir")
     args = parse_arguments([*own, *extra])
-    if args.head == "full":  # with it an update takes two thirds of the time; what `extra` says still wins
-        args = parse_arguments([*own, "--channels_last", *extra])
     brought = {"model_name_or_path": f"{out}/base", "dataset_name": f"{out}/gift-i", "output_dir": run}
     for name, value in brought.items():
         if Path(getattr(args, name)) != Path(value):

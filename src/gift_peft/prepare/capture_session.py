@@ -1,23 +1,28 @@
 """A capture on its way: frames come in, the coach judges them, photos go into groups of a raw tree."""
 
+import errno
+import os
 import re
-import shlex
 from collections.abc import Generator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gift_peft.captures.clip import CLIP_SUFFIXES, Clip, ClipFrame, find_clips, write_frame
-from gift_peft.captures.folders import files_below
+from gift_peft.captures.clip import CLIP_SUFFIXES, Clip, ClipFrame, find_clips, prepare_line, write_frame
+from gift_peft.captures.folders import files_below, holds_no_photos
 from gift_peft.captures.live import live_frames
 from gift_peft.captures.tree import find_groups
+from gift_peft.files import is_leftover
 from gift_peft.images import is_image_file, open_image, to_mask
-from gift_peft.prepare.coach import Advice, Coach
+from gift_peft.prepare.coach import BLINK, Advice, Coach
 from gift_peft.rules import SPLITS, check_group_id
 
+PAUSE = 2.0  # seconds, as which the time counts in which a stream was closed
 ENOUGH = "enough: more photos add nothing"
-TREAT = "now spray or cover the surface without touching the camera, then type r and Enter; q and Enter ends"
+TREAT = "now spray or cover the surface without touching the camera, then {}"
+TYPED = "type r and Enter; q and Enter ends"  # how a person at a terminal asks for the reference, and ends without
 
 
 @dataclass(frozen=True)
@@ -46,21 +51,45 @@ def open_source(text: str) -> Source:
 
 
 def check_tree(out: Path) -> None:
-    """Raise ValueError unless a group may be put into this folder: it is absent, empty, or a raw tree."""
+    """Raise ValueError unless a group may be put into this folder: it is absent, empty, or a raw tree.
+
+    Group folders that are empty, perhaps made for photos to come, are passed over.
+    """
     if out.exists() and not out.is_dir():
         raise ValueError(f"OUT {out} is a file: name a folder")
-    if not out.is_dir() or not any(out.iterdir()):
+    if not (there := _contents(out)):
         return
     for split in SPLITS:
         if (out / split).is_dir() and not (out / split / "metadata.parquet").exists():
             raise ValueError(f"OUT {out} has a folder {split}: name one of its splits, as {out / split}")
-    try:
-        folders = [folder for found in find_groups(out).values() for folder in found]
-    except FileNotFoundError:
-        folders = []
-    files = [list(files_below(folder)) for folder in folders]
-    if not files or not all(any(map(is_image_file, found)) or find_clips(found) for found in files):
+    if (out / "metadata.parquet").exists():
+        raise ValueError(f"OUT {out} is part of a prepared folder: name a folder of photos as they were taken")
+    groups = _files_of_groups(out)
+    files = list(filter(None, groups.values()))
+    loose = not files and any(path.is_file() for path in there)
+    others = [one for one in files if not any(map(is_image_file, one)) and not find_clips(one)]
+    if not groups or loose or others:
         raise ValueError(f"OUT {out} holds something else than groups of photos: name another folder")
+
+
+def _files_of_groups(out: Path) -> dict[Path, list[Path]]:
+    """What lies in each group's folder of a raw tree; nothing where there are none."""
+    try:
+        return {folder: list(files_below(folder)) for found in find_groups(out).values() for folder in found}
+    except FileNotFoundError:
+        return {}
+
+
+def _contents(folder: Path) -> list[Path]:
+    """What a person has put into a folder; nothing where there is none."""
+    return [path for path in folder.iterdir() if not is_leftover(path.name)] if folder.is_dir() else []
+
+
+def free_name(out: Path) -> str:
+    """The next free `group_N`."""
+    taken = [path.name for path in out.iterdir()] if out.is_dir() else []
+    numbers = [int(found[1]) for name in taken if (found := re.match(r"group_(\d+)", name))]
+    return f"group_{max(numbers, default=0) + 1}"
 
 
 class Session:
@@ -72,13 +101,25 @@ class Session:
         mask (`str`, *optional*): file of the target's mask.
         most (`int`): photos of a group.
         reference_at (`float`, *optional*): seconds, when the treated surface is shown.
-        asks (`bool`): whether there is a person to ask for the reference.
+        asks (`str`, *optional*): how a person asks for the reference, as TYPED; None if there is nobody.
+
+    Attributes:
+        photos (`dict[Path, list[Path]]`): of each group's folder, those that were taken and not dropped.
+        references (`list[Path]`).
+        ended (`bool`): nothing more is taken.
+        advice (`Advice`): on the last frame.
 
     Raises ValueError or an OSError naming the file or group.
     """
 
     def __init__(
-        self, out: Path, group: str | None, mask: str | None, most: int, reference_at: float | None, asks: bool
+        self,
+        out: Path,
+        group: str | None = None,
+        mask: str | None = None,
+        most: int = 12,
+        reference_at: float | None = None,
+        asks: str | None = None,
     ) -> None:
         check_tree(out)
         self.out, self.reference_at, self.asks = out, reference_at, asks
@@ -86,36 +127,64 @@ class Session:
         self.mask = None if mask is None else to_mask(open_image(mask), mask)
         if self.mask is not None and not self.mask.any():
             raise ValueError(f"{mask}: the mask is empty; draw the target in white")
-        self.name = self._free_name(group)
+        self.name = free_name(out) if group is None else self._checked_name(group)
         self.folder = out / self.name
         self.coach = Coach(self.mask, most)
         self.advice = Advice()
-        self.photos: dict[Path, int] = {}  # of each group
+        self.photos: dict[Path, list[Path]] = {}
         self.references: list[Path] = []
         self.ended = False
         self.frames, self.seconds = 0, 0.0
         self.size: tuple[int, int] | None = None  # (height, width) of the frames
+        self._last_still = float("-inf")  # seconds
+        self._before = 0, 0.0  # frames and seconds of streams that ended
+        self._began: set[Path] = set()  # folders of groups that are ours
+        self._masks: dict[Path, int] = {}  # of each group that has one of ours, when it was written
         self._reference_due = self._said_enough = False
         self._said: frozenset[str] = frozenset()
 
     @property
+    def figures(self) -> dict[str, str]:
+        """What was measured of the last frame, in words."""
+        advice = self.advice
+        return {
+            "drift": "-" if advice.drift is None else f"{advice.drift:.1f} px",
+            "sharp": "-" if advice.sharpness is None else f"{advice.sharpness:.0%}",
+            "white": f"{advice.bright:.0%}",
+            "black": f"{advice.dark:.0%}",
+            "changed": f"{advice.changed:.0%}",
+        }
+
+    @property
     def status(self) -> str:
         """One line for a terminal."""
-        advice = self.advice
-        drift = "-" if advice.drift is None else f"{advice.drift:.1f} px"
-        sharp = "-" if advice.sharpness is None else f"{advice.sharpness:.0%}"
         parts = [
             f"{self.seconds:.0f} s",
-            "still " if advice.still else "moving",
-            f"drift {drift}",
-            f"sharp {sharp}",
-            f"white {advice.bright:.0%}",
-            f"black {advice.dark:.0%}",
-            f"changed {advice.changed:.0%}",
-            f"{self.photos.get(self.folder, 0)} photos",
-            *(item.code.replace("_", " ").upper() for item in advice.warnings),
+            "still " if self.advice.still else "moving",
+            *(f"{name} {value}" for name, value in self.figures.items()),
+            f"{len(self.photos.get(self.folder, ()))} photos",
+            *(item.code.replace("_", " ").upper() for item in self.advice.warnings),
         ]
         return " | ".join(parts)
+
+    @property
+    def next_step(self) -> str:
+        """What a person does now, in one sentence."""
+        advice, wanted = self.advice, self.coach.wanted
+        if advice.warnings and wanted != "photo":
+            text = advice.warnings[0].text
+        elif wanted is not None:
+            what = "the treated reference" if wanted == "reference" else "a photo"
+            text = f"keep still: the next still moment is {what}"
+        elif advice.enough:
+            text = f"{ENOUGH}; {TREAT.format(self.asks)}" if self.asks else ENOUGH
+        elif self.seconds - self._last_still > BLINK:
+            text = "hold camera and scene still for a second"
+        elif self.coach.waits:
+            text = "change what is reflected or seen through, and step aside"
+        else:
+            text = "keep still: a photo is taken if this is new"
+        return f"{text[0].upper()}{text[1:]}."
 
     def see(self, frame: ClipFrame, typed: str | None = None) -> list[str]:
         """Look at a frame and keep a photo if one is due; what is to be said.
@@ -125,15 +194,16 @@ class Session:
         said = self._listen(typed)
         if self.ended:
             return []
-        self.frames, self.seconds = self.frames + 1, frame.seconds
+        index, seconds = self._before[0] + frame.index, self._before[1] + frame.seconds
+        self.frames, self.seconds = self.frames + 1, seconds
         size = frame.pixels.shape[:2]
         if self.size not in (None, size):
             self.ended = True
             (height, width), (old_height, old_width) = size, self.size
             text = f"the frames are {width}x{height} now, and were {old_width}x{old_height}: nothing more is taken"
-            return [f"{frame.seconds:7.1f} s  {text}"]
+            return [f"{seconds:7.1f} s  {text}"]
         self.size = size
-        if self.reference_at is not None and not self._reference_due and frame.seconds >= self.reference_at:
+        if self.reference_at is not None and not self._reference_due and seconds >= self.reference_at:
             if self.folder not in self.photos:
                 raise ValueError(
                     f"--reference-at: no photo was taken in {self.folder} before that time; the reference comes last, "
@@ -142,9 +212,11 @@ class Session:
             self._reference_due = True
             self.coach.ask_reference()
         try:
-            self.advice = self.coach.see(frame.index, frame.seconds, frame.pixels)
+            self.advice = self.coach.see(index, seconds, frame.pixels)
         except ValueError as error:
             raise ValueError(f"{self.mask_file}: {error}") from None
+        if self.advice.still:
+            self._last_still = seconds
         if self.advice.new_group:
             self.folder, self._said_enough = self._next_folder(), False
             said.append(f"the camera stays where it is now: the next photos are a new group, {self.folder}")
@@ -156,8 +228,39 @@ class Session:
         if self.advice.enough and not self._said_enough:
             self._said_enough = True
             said.append(ENOUGH)
-            said += [TREAT] if self.asks else []
-        return [f"{frame.seconds:7.1f} s  {text}" for text in said]
+            said += [TREAT.format(self.asks)] if self.asks else []
+        return [f"{seconds:7.1f} s  {text}" for text in said]
+
+    def resume(self) -> None:
+        """Frames of a stream that was opened again follow, of the same camera."""
+        self.ended = False
+        self._before = self.frames, self.seconds + PAUSE
+        self.coach.restart()
+
+    def drop(self, photo: Path) -> str:
+        """Delete a photo that was taken here, or the treated reference, which may then be taken again; what was done.
+
+        Raises ValueError: it is none of these, or the last photo beside a reference.
+        """
+        if photo in self.references:
+            photo.unlink(missing_ok=True)
+            self.references.remove(photo)
+            return f"dropped the treated reference {photo}"
+        folder = photo.parent
+        if photo not in self.photos.get(folder, ()):
+            raise ValueError(f"{photo}: no photo that was taken here")
+        left = self.photos[folder]
+        if len(left) == 1 and any(path.parent == folder for path in self.references):
+            raise ValueError(f"{photo}: the last photo beside the treated reference; drop that first")
+        photo.unlink(missing_ok=True)
+        if folder == self.folder:
+            self.coach.drop(left.index(photo))
+            self._said_enough = False
+        left.remove(photo)
+        if not left:
+            del self.photos[folder]
+            self._remove_empty(folder)
+        return f"dropped {photo}"
 
     def finish(self, source: str) -> list[str]:
         """What there is now, and the command to type next.
@@ -175,7 +278,8 @@ class Session:
                 f"the photos are kept in {', '.join(map(str, self.photos))}"
             )
         lines = []
-        for folder, count in self.photos.items():
+        for folder, photos in self.photos.items():
+            count = len(photos)
             told = f"{folder}: {count} photo{'s' if count > 1 else ''}"
             if folder / "reference.png" in self.references:
                 told += " and the treated reference"
@@ -187,21 +291,29 @@ class Session:
         if self.mask is None:
             place = next(iter(self.photos)) / "mask.png"
             lines.append(f"Draw the target in {place}, white where the glass or mirror is.")
-        return [*lines, f"Next: {shlex.join(['gift-peft', 'prepare', str(self.out), f'{self.out}-prepared'])}"]
+        if empty := [folder.name for folder, files in _files_of_groups(self.out).items() if not files]:
+            lines.append(f"Without photos yet, which `prepare` will say, too: {', '.join(empty)}.")
+        raw = self.out
+        if Path(os.path.abspath(raw)).name in SPLITS:  # a split of the raw tree above
+            raw = raw.parent if raw.name not in ("", "..") else raw / ".."
+        return [*lines, f"Next: {prepare_line(raw)}"]
 
-    def _free_name(self, group: str | None) -> str:
-        if group is None:
-            taken = [path.name for path in self.out.iterdir()] if self.out.is_dir() else []
-            numbers = [int(found[1]) for name in taken if (found := re.match(r"group_(\d+)", name))]
-            return f"group_{max(numbers, default=0) + 1}"
+    def _checked_name(self, group: str) -> str:
         check_group_id(group)
-        if (self.out / group).exists():
-            raise ValueError(f"{self.out / group}: it is there already; name another group (--group)")
+        if group.casefold() in (*SPLITS, "val", "valid") or holds_no_photos(group):
+            raise ValueError(f"group {group}: a folder of this name is no group in a raw tree; name another")
+        if not self._is_free(self.out / group):
+            raise ValueError(f"{self.out / group}: it is there already; name another group")
         return group
+
+    @staticmethod
+    def _is_free(folder: Path) -> bool:
+        """Whether a group may begin there: it is absent, or somebody made an empty folder for it."""
+        return not os.path.lexists(folder) or (folder.is_dir() and not folder.is_symlink() and not _contents(folder))
 
     def _next_folder(self) -> Path:
         number = 2
-        while (folder := self.out / f"{self.name}__{number}").exists():
+        while not self._is_free(folder := self.out / f"{self.name}__{number}"):
             number += 1
         return folder
 
@@ -223,15 +335,47 @@ class Session:
         return ["the next still moment is a photo"]
 
     def _keep(self, advice: Advice) -> str:
-        count = self.photos.get(self.folder, 0)
-        path = self.folder / ("reference.png" if advice.is_reference else f"{count + 1:03d}.png")
-        if not count and self.mask is not None:
-            write_frame(self.folder / "mask.png", self.coach.mask_here.astype(np.uint8) * 255)
-        write_frame(path, advice.photo)
+        try:
+            path = self._write(advice)
+        except OSError:
+            if not advice.is_reference:
+                self.coach.drop(-1, again=True)  # when the disk has room
+            raise
         if advice.is_reference:
             self.references.append(path)
             self.ended = True
             return f"treated reference {path}"
-        self.photos[self.folder] = count + 1
+        self.photos.setdefault(self.folder, []).append(path)
         what = "target" if self.mask is not None else "picture"
         return f"photo {path}, {advice.changed:.0%} of the {what} changed so far"
+
+    def _write(self, advice: Advice) -> Path:
+        """The photo in its group; the folder of one that another program has filled meanwhile is left alone."""
+        taken = self.photos.get(self.folder, ())
+        if not taken and self.folder not in self._began and not self._is_free(self.folder):
+            self.folder = self._next_folder()
+        self._began.add(self.folder)
+        number = int(taken[-1].stem) + 1 if taken else 1
+        path = self.folder / ("reference.png" if advice.is_reference else f"{number:03d}.png")
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, "another program has put a file there meanwhile", str(path))
+        try:
+            if not taken and self.mask is not None:
+                mask = self.folder / "mask.png"
+                write_frame(mask, self.coach.mask_here.astype(np.uint8) * 255)
+                self._masks[self.folder] = mask.stat().st_mtime_ns
+            write_frame(path, advice.photo)
+        except OSError:
+            if not taken:
+                self._remove_empty(self.folder)
+            raise
+        return path
+
+    def _remove_empty(self, folder: Path) -> None:
+        """A group without photos goes, unless something of somebody else's is in it."""
+        mask = folder / "mask.png"
+        written = self._masks.pop(folder, None)
+        if written is not None and mask.is_file() and mask.stat().st_mtime_ns == written:
+            mask.unlink()
+        with suppress(OSError):
+            folder.rmdir()

@@ -46,7 +46,7 @@ def run(argv: Sequence[str]) -> int:
     """
     args = make_parser().parse_args(argv)
     from gift_peft.captures.clip import read_time
-    from gift_peft.prepare.capture_session import Session, open_source
+    from gift_peft.prepare.capture_session import TYPED, Session, open_source
 
     at = None if args.reference_at is None else read_time(args.reference_at, "--reference-at")
     if at is not None and at.clip is not None:
@@ -55,7 +55,8 @@ def run(argv: Sequence[str]) -> int:
     live = source.clip is None
     if at is not None and live:
         raise ValueError("--reference-at is for clips; at a camera, type r and Enter when the surface is treated")
-    session = Session(Path(args.out), args.group, args.mask, args.max_frames, at and at.seconds, live)
+    asks = TYPED if live else None
+    session = Session(Path(args.out), args.group, args.mask, args.max_frames, at and at.seconds, asks)
     typed = _typed() if live and sys.stdin.isatty() else itertools.repeat(None)
     status = _Status()
     frames = source.frames()

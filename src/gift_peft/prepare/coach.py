@@ -109,6 +109,8 @@ class _Group:
     """The photos of one pose: the cells of each, and what later frames are compared with."""
 
     cells: list[np.ndarray] = field(default_factory=list)
+    dropped: list[np.ndarray] = field(default_factory=list)  # of photos that a person did not want
+    first: np.ndarray | None = None  # cells of the first photo, dropped or not: in its light the others are judged
     anchor: Anchor | None = None
     focus: Focus | None = None
     bright: float = 0.0
@@ -145,11 +147,31 @@ class Coach:
     def ask_reference(self) -> None:
         """The next still moment is the treated reference."""
         self.wanted = "reference"
-        self._restart()
+        self.restart()
 
     def ask_photo(self) -> None:
         """The next still moment is a photo, whatever is said about it."""
         self.wanted = "photo"
+
+    def drop(self, number: int, again: bool = False) -> None:
+        """A photo of this group, by its number from 0, does not count; `again`: what it showed may come again.
+
+        After the last one the group begins anew, from wherever the camera is then.
+        """
+        group = self.group
+        cells = group.cells.pop(number)
+        group.dropped += [] if again else [cells]
+        group.old_changes = 0
+        if not group.cells:
+            self.group = _Group(dropped=group.dropped[-1:])
+            self.wanted = None if self.wanted == "reference" else self.wanted
+        self._advice = replace(self._advice, changed=self._changed() if group.cells else 0.0, enough=False)
+        self.restart()
+
+    @property
+    def waits(self) -> bool:
+        """Whether nothing has moved since the last photo."""
+        return bool(self.group.cells) and not self._stirred
 
     def see(self, index: int, seconds: float, pixels: np.ndarray) -> Advice:
         """Advice on the next frame, (H, W, 3) uint8 BGR at this time. Raises ValueError if it is of another size."""
@@ -177,7 +199,7 @@ class Coach:
             before = self._advice.codes & {*SPOILING}
             self._say(seconds, self._measure(seconds))
             if self._advice.codes & {*SPOILING} != before:
-                self._restart()  # frames from before are not of what is judged now
+                self.restart()  # frames from before are not of what is judged now
             else:
                 self._decide(seconds, moment)
         return self._advice
@@ -197,7 +219,7 @@ class Coach:
             if dark > MAX_BLACK:
                 found.append(Remark("dark", f"under-exposed: {black}; lengthen the exposure"))
             return found
-        gain = 1 / light_gain(cells, group.cells[0], self.outside)
+        gain = 1 / light_gain(cells, group.first, self.outside)
         if bright > group.bright + MORE_CLIPPED and gain > IN_BRIGHTER:
             return [Remark("over_exposed", f"over-exposed: {white}, and it was {group.bright:.0%}; lock the exposure")]
         if dark > group.dark + MORE_CLIPPED and gain < 1 / IN_BRIGHTER:
@@ -225,7 +247,7 @@ class Coach:
         if motion is None:
             if self.outside is not None and self.outside.sum() < LEAST_OUTSIDE:
                 return []  # the target fills the picture: that it shows something else says nothing of the camera
-            changed = difference(cells, self.group.cells[0], self.outside) > 2 * OTHER_CONTENT
+            changed = difference(cells, self.group.first, self.outside) > 2 * OTHER_CONTENT
             share = float((changed if self.outside is None else changed[self.outside]).mean())
             if share <= STRUCTURE_CHANGED:
                 return []
@@ -268,7 +290,8 @@ class Coach:
                 return
         elif self.wanted == "reference" and self._advice.codes & {"moved", "blurred"}:
             return
-        is_new = all(self._differs(self._means.cells, photo) for photo in self.group.cells)
+        known = (*self.group.cells, *self.group.dropped)
+        is_new = all(self._differs(self._means.cells, photo) for photo in known)
         if self.wanted or (is_new and len(self.group.cells) < self.most):
             if ready:
                 self._take(seconds, moment)
@@ -278,7 +301,8 @@ class Coach:
                 self.group.old_changes += self._stirred
                 self._stirred = False
                 count = len(self.group.cells)
-                text = f"nothing new shows since the last of {count} photos: change what is reflected or seen through"
+                last = {0: "the photo that was dropped", 1: "the photo"}.get(count, f"the last of {count} photos")
+                text = f"nothing new shows since {last}: change what is reflected or seen through"
                 self._nothing_new = Remark("unchanged", text)
                 self._say(seconds, self._wrong)
                 self._advice = replace(self._advice, enough=self._enough)
@@ -291,7 +315,7 @@ class Coach:
         if not is_reference:
             group = self.group
             if group.anchor is None:
-                mask = self.mask_here
+                mask, group.first = self.mask_here, self._means.cells
                 group.anchor = Anchor(np.clip(np.round(self._means.gray), 0, 255).astype(np.uint8), mask)
                 group.focus = Focus(*self._means.halves, mask)
                 group.bright, group.dark = self._advice.bright, self._advice.dark
@@ -313,7 +337,7 @@ class Coach:
         self.group = _Group()
         self._wrong, self._nothing_new, self._since, self._moved_since = [], None, {}, None
         self._advice = Advice(still=True, new_group=True)
-        self._restart()
+        self.restart()
 
     def _can_carry_mask(self) -> bool:
         """Whether it is known where the target is after the camera's motion, and is in the picture."""
@@ -327,7 +351,7 @@ class Coach:
             self.mask if self.mask is None or np.array_equal(self.matrix, np.eye(3)) else warp(self.mask, self.matrix)
         )
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
         """A new moment begins: frames seen so far are no photo of it."""
         self.watch.finish()
         self._means = _Means()

@@ -207,7 +207,7 @@ def refine(proposal: Proposal, image: np.ndarray, method: str) -> Proposal:
     """
     if image.shape != (*proposal.mask.shape, 3) or image.dtype != np.uint8:
         raise ValueError(f"refining takes a uint8 RGB image of the proposal's size, got {image.shape} {image.dtype}")
-    model = _sam2(method)
+    model = load_sam2(method)
     labels, stats = _regions(proposal.mask, least_area=0)
     refined = np.zeros_like(proposal.mask)
     kept = 0
@@ -223,7 +223,8 @@ def refine(proposal: Proposal, image: np.ndarray, method: str) -> Proposal:
 
 
 @lru_cache(maxsize=1)
-def _sam2(method: str):
+def load_sam2(method: str):
+    """The network that `refine` asks, loaded once. Raises ValueError as it does."""
     family, _, model_id = method.partition(":")
     if family != "sam2" or not model_id:
         raise ValueError(f"refine {method!r}: write sam2:<model id>, for example sam2:facebook/sam2.1-hiera-small")

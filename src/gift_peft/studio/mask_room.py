@@ -52,7 +52,10 @@ class MaskRoom:
 
     def groups(self, _: Any = None) -> dict:
         """`groups`, each with `name` ("train/hall"), `state` and `done`."""
-        found = self._folders().items()
+        try:
+            found = self._folders().items()
+        except FileNotFoundError:
+            raise ValueError(f"{self.root} has no groups yet: take photos (Capture), or put them there") from None
         return {"groups": [self._state(f"{split}/{group}", split, folder) for (split, group), folder in found]}
 
     def progress(self, request: dict) -> dict:

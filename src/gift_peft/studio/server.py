@@ -11,7 +11,7 @@ import signal
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 if TYPE_CHECKING:  # each brings its own heavy packages
+    from gift_peft.studio.capture_room import CaptureRoom
     from gift_peft.studio.compare_room import CompareRoom
     from gift_peft.studio.mask_room import MaskRoom
     from gift_peft.studio.target_room import TargetRoom
@@ -41,18 +42,23 @@ POLICY = (
 LARGEST_PHOTO = "100mb"
 # The viewer of points tries WebGPU first and complains where a browser has it without a device; WebGL does as well.
 HEAD = "<script>delete Navigator.prototype.gpu;</script>"
+# On a telephone, too, all rooms have their tab in sight.
+HEAD += "<style>@media (max-width: 600px) { .tab-container button { padding: 0 .4rem !important } }</style>"
 
 
 @dataclass
 class Rooms:
     """What there is to show; None where a room has nothing, and `lacking` says what it needs."""
 
+    capture: "CaptureRoom | None" = None
     masks: "MaskRoom | None" = None
     targets: "TargetRoom | None" = None
     compare: "CompareRoom | None" = None
 
 
 LACKING = {
+    "Capture": "Photos are taken by a camera of this computer, a stream or a clip, which you name: "
+    "`gift-peft studio RAW --source 0`. RAW may be a new folder.",
     "Masks": "Masks are drawn on a raw tree, the folder of photos or clips: `gift-peft studio RAW`.",
     "Targets": "Surface targets are shown of a prepared folder: `gift-peft studio OUT`, after "
     "`gift-peft proxies --base BASE --dataset OUT --target surface`.",
@@ -138,8 +144,8 @@ def build(rooms: Rooms, title: str) -> Any:
     """The gradio page; the first room that has something is open."""
     import gradio as gr
 
-    tabs = {"Masks": rooms.masks, "Targets": rooms.targets, "Compare": rooms.compare}
-    fill = {"Masks": _masks_tab, "Targets": _targets_tab, "Compare": _compare_tab}
+    tabs = {"Capture": rooms.capture, "Masks": rooms.masks, "Targets": rooms.targets, "Compare": rooms.compare}
+    fill = {"Capture": _capture_tab, "Masks": _masks_tab, "Targets": _targets_tab, "Compare": _compare_tab}
     first = next(name for name, room in tabs.items() if room is not None)
     with gr.Blocks(title=title, analytics_enabled=False) as blocks:
         gr.Markdown(f"# {title}")
@@ -206,15 +212,26 @@ def _answer(method: Callable[[dict], dict]) -> Callable[[Any], dict]:
     return answer
 
 
+def _capture_tab(gr: Any, room: "CaptureRoom", _: Any) -> None:
+    methods = (room.look, room.start, room.resume, room.press, room.drop, room.strip)
+    _own_page(gr, "capture_coach", "capture", methods)
+
+
 def _masks_tab(gr: Any, room: "MaskRoom", _: Any) -> None:
     methods = (room.groups, room.progress, room.open, room.photo, room.start, room.draw, room.save)
+    _own_page(gr, "mask_editor", "masks", methods)
+
+
+def _own_page(gr: Any, name: str, elem_id: str, methods: Sequence[Callable[[dict], dict]]) -> None:
+    """A room of our own HTML, CSS and JavaScript, whose `server` has these methods."""
+    html, css, code = ((PAGE / f"{name}.{kind}").read_text(encoding="utf-8") for kind in ("html", "css", "js"))
     gr.HTML(
         "",
-        html_template=(PAGE / "mask_editor.html").read_text(encoding="utf-8"),
-        css_template=(PAGE / "mask_editor.css").read_text(encoding="utf-8"),
-        js_on_load=(PAGE / "mask_editor.js").read_text(encoding="utf-8"),
+        html_template=html,
+        css_template=(PAGE / "room.css").read_text(encoding="utf-8") + css,
+        js_on_load=code,
         server_functions=[_answer(method) for method in methods],
-        elem_id="masks",
+        elem_id=elem_id,
     )
 
 
@@ -280,12 +297,13 @@ def _compare_tab(gr: Any, room: "CompareRoom", _: Any) -> None:
         with gr.Column():
             photo = gr.Image(
                 type="filepath",
-                image_mode=None,  # the file as it is: `read_image` turns and converts it, or says why not
                 label="Photo",
                 elem_id="photo",
                 height=340,
                 sources=["upload", "clipboard"],
             )
+            # The file as it is: `read_image` turns and converts it, or says why not.
+            photo.preprocess = lambda given: None if given is None else given.path
             scale = gr.Slider(
                 0, 1, 1, step=0.05, label="Adapter scale: 0 is the base", elem_id="scale", visible=adapted
             )

@@ -178,7 +178,8 @@ class GiftTrainingArguments:
     )
     compile: bool = _arg("torch.compile the encoder's blocks; changes the bits", False)
     channels_last: bool | None = _arg(
-        "the head's convolutions in channels-last layout; changes the bits; default: on CUDA, with head: full", None
+        "the head's convolutions in channels-last layout; changes the bits; default: if it trains in full",
+        None,
     )
     num_train_epochs: int = _arg("passes over the groups (one update per group) or, for surface, their images", 50)
     max_steps: int = _arg("stop after this many updates; -1: num_train_epochs decides", -1)

@@ -32,6 +32,7 @@ from gift_peft.models.pixels import resolve_size
 from gift_peft.rules import check_pair
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.loop import adapt, find_recipe
+from gift_peft.training.speed import channels_last_head, tuned_for
 from gift_peft.training.start import check_run, make_accelerator
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
@@ -123,6 +124,7 @@ def _measure(
     index = max(range(len(counts)), key=list(counts.values()).__getitem__)
     print(f"Measuring group {list(counts)[index]} ...", flush=True)
     group = collate_group(parsed(rows)[index], processor, size)
+    channels_last = tuned_for(accelerator.device, args.channels_last, args.head)
     try:
         network, optimizer = adapt(args, base, recipe, accelerator)
         model = DepthModel(network, processor, size)
@@ -138,7 +140,8 @@ def _measure(
         valid = None if group.valid is None else group.valid[:count]
         for _ in range(2):
             start = time.monotonic()
-            step.accumulate(*tensors, valid, group.names[:count])
+            with channels_last_head(network, channels_last):
+                step.accumulate(*tensors, valid, group.names[:count])
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
             update = (time.monotonic() - start) / count

@@ -37,7 +37,7 @@ from gift_peft.training.precision import exact_output
 from gift_peft.training.profiling import profile_updates
 from gift_peft.training.progress import Progress, how_to_resume, summary
 from gift_peft.training.schedule import Schedule
-from gift_peft.training.speed import checkpoint_blocks, compile_blocks, make_adam, tuned_for, use_channels_last
+from gift_peft.training.speed import channels_last_head, checkpoint_blocks, compile_blocks, make_adam, tuned_for
 from gift_peft.training.start import (
     Interrupted,
     agree,
@@ -98,7 +98,11 @@ def train(
 def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command: str | None) -> TrainResult:
     # check: what can be known to fail fails before a model is loaded
     output, checkpoint = check_run(args, accelerator)
-    args = replace(args, channels_last=tuned_for(accelerator.device, args.channels_last, args.head))
+    before = checkpoints.saved_identity(checkpoint) if checkpoint else {}
+    layout = tuned_for(accelerator.device, args.channels_last, args.head)
+    if args.channels_last is None:  # unless asked, a run keeps what it began with
+        layout = before.get("channels_last", layout)
+    args = replace(args, channels_last=layout)
 
     # load: float32 weights whatever the checkpoint's, bf16 is autocast's business (paper, implementation details)
     base, processor = load_base(args.model_name_or_path, args.model_revision)
@@ -114,13 +118,14 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command
     # objective
     network, optimizer = adapt(args, base, recipe, accelerator)
     objective = OBJECTIVES[args.target](args, train_groups, network, optimizer, accelerator)
-    settled = objective.settle(checkpoints.saved_identity(checkpoint) if checkpoint else {})
+    settled = objective.settle(before)
     args, identity = replace(args, **settled), identity | {k: v for k, v in settled.items() if k in identity}
     optimizer, schedule = objective.optimizer, Schedule(args, objective.epoch_steps)
     if args.profile:
         with closing(objective.feed(0)) as feed:
             inputs = (group.inputs for group in feed)
-            accelerator.print(profile_updates(args.profile, objective.step, optimizer, train_groups, inputs))
+            with channels_last_head(network, bool(args.channels_last)):
+                accelerator.print(profile_updates(args.profile, objective.step, optimizer, train_groups, inputs))
         return TrainResult(output, 0, [], None)
 
     # fit
@@ -239,8 +244,6 @@ def adapt(
     exact_output(model)
     if args.gradient_checkpointing:
         checkpoint_blocks(model)
-    if args.channels_last:
-        use_channels_last(model)
     if args.compile:
         compile_blocks(model)
     optimizer = make_adam(

@@ -8,6 +8,7 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
+from functools import partial
 from itertools import repeat
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from gift_peft.losses import gift_terms, masked_l1
 from gift_peft.training.arguments import GiftTrainingArguments
 from gift_peft.training.mask_checks import check_surroundings, warn_of_masks
 from gift_peft.training.schedule import updates_after
-from gift_peft.training.speed import checkpoint_blocks
+from gift_peft.training.speed import channels_last_head, checkpoint_blocks
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
 
@@ -96,7 +97,8 @@ class Consensus:
         return Loaded(group.group_id, inputs.pin_memory() if self.groups.pin else inputs)
 
     def accumulate(self, group: Loaded) -> Losses:
-        output = self.step.accumulate(*group.inputs.arguments())
+        with channels_last_head(self.step.model, bool(self.args.channels_last)):
+            output = self.step.accumulate(*group.inputs.arguments())
         return Losses(float(output.total), float(output.consistency), float(output.distillation), output.num_pairs)
 
     def named(self, group: Loaded) -> str:
@@ -212,7 +214,8 @@ class Surface:
             on_device(getattr(image, name) for image in images) for name in ("pixel_values", "mask", "surface_target")
         ]
         names = [name for image in images for name in image.names]
-        output = self.step.accumulate(*tensors, valid, names, 0.0 if share.idle else 1 / share.count)
+        with channels_last_head(self.network, bool(self.args.channels_last)):
+            output = self.step.accumulate(*tensors, valid, names, 0.0 if share.idle else 1 / share.count)
         return Losses(*output, num_pairs=0, count=share.count)
 
     def named(self, share: Share) -> str:
@@ -246,8 +249,10 @@ def settle_micro_batch(
     """
     if before:
         return {"micro_batch_size": before.get("micro_batch_size")}
+    layout = partial(channels_last_head, model, bool(args.channels_last))
     try:
-        return {"micro_batch_size": choose()}
+        with layout():
+            return {"micro_batch_size": choose()}
     except torch.OutOfMemoryError:
         if args.gradient_checkpointing:
             raise
@@ -256,7 +261,8 @@ def settle_micro_batch(
         "(gradient_checkpointing)"
     )
     checkpoint_blocks(model)
-    return {"gradient_checkpointing": True, "micro_batch_size": choose()}
+    with layout():
+        return {"gradient_checkpointing": True, "micro_batch_size": choose()}
 
 
 def look_at_all(

@@ -47,7 +47,9 @@ function take(state) {  // a saved mask to begin with, and what this tab had dra
 async function list() {
   const { groups = [] } = await ask("groups");
   $(".group").replaceChildren(...groups.map((one) => new Option(`${one.done ? "✓" : "○"} ${one.name}: ${one.state}`, one.name)));
-  const first = groups.find((one) => one.name === room.group) || groups.find((one) => !one.done) || groups[0];
+  const wanted = window.studioGroup || room.group;  // where the Capture room has taken photos
+  window.studioGroup = undefined;
+  const first = groups.find((one) => one.name === wanted) || groups.find((one) => !one.done) || groups[0];
   if (first) $(".group").value = first.name;
   return first && first.name;
 }
@@ -338,4 +340,6 @@ for (const button of element.querySelectorAll("[data-do]")) button.addEventListe
 $(".group").addEventListener("change", () => open($(".group").value));
 $(".for").addEventListener("change", () => choose($(".for").value));
 use("hit");
-list().then((name) => name && open(name));
+const begin = () => list().then((name) => name && open(name));
+window.addEventListener("studio group", begin);
+begin();

@@ -25,8 +25,7 @@ class Rule:
 class Trial:
     """One training. `rule` None is the paper's objective; `train` and `score` are (set, `part`) pairs.
 
-    `jitter` is the largest relative change of brightness, contrast and, a third of it, of each color's share, drawn
-    anew for each photo of an update.
+    `jitter` as `--color-jitter`.
     """
 
     name: str

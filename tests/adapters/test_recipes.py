@@ -65,6 +65,17 @@ def test_head_lora(model):
     assert torch.equal(depth(adapted), depth(tiny_model()))
 
 
+def test_head_lora_leaves_out_what_peft_cannot_merge(model):
+    model.head.conv1.padding_mode = "replicate"  # PEFT's own convolution beside it pads with zeros
+    model.head.conv2.padding_mode = "reflect"
+    adapted = trained(get_gift_model(model, head="lora")).eval()
+    names = trainable(adapted)
+    assert not any(name.startswith(("head.conv1.", "head.conv2.")) for name in names)
+    assert any(name.startswith("head.conv3.") for name in names)
+    before = depth(adapted)
+    torch.testing.assert_close(depth(adapted.merge_and_unload()), before, rtol=1e-4, atol=1e-5)
+
+
 def test_head_none(model):
     names = trainable(get_gift_model(model, head="none"))
     assert len(names) == 32 and all("lora_" in name for name in names)

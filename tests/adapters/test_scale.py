@@ -9,7 +9,7 @@ from transformers import AutoModelForDepthEstimation
 
 from gift_peft.adapters.folder import save_adapter
 from gift_peft.adapters.recipes import HEADS, get_gift_model
-from gift_peft.adapters.scale import active_lora, active_saved_modules, set_adapter_scale
+from gift_peft.adapters.scale import active_lora, active_saved_modules, scale_comes_back, set_adapter_scale
 
 # transformers 5.23 says so when peft 0.21 loads an adapter; neither is ours.
 pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
@@ -96,6 +96,28 @@ def test_setting_the_scale_switches_everything_on(way, adapter_folder):
     for scale, expected in ((1, adapted), (0, depth(tiny_model())), (1, adapted)):
         set_adapter_scale(model, scale)
         assert torch.equal(depth(model), expected)
+
+
+@pytest.mark.parametrize("head", ["full", "lora"])
+def test_the_scale_comes_back_to_the_bit(head):
+    model = trained(get_gift_model(tiny_model(), rank=6, head=head))  # alpha / 6 is no power of two
+    for scale in (1, 0.3, -0.7, 0.1):
+        set_adapter_scale(model, scale)
+        scalings, before = [layer.scaling[name] for layer, name in active_lora(model)], depth(model)
+        with pytest.raises(RuntimeError, match="stop"), scale_comes_back(model):
+            set_adapter_scale(model, 0.25)
+            assert not torch.equal(depth(model), before)
+            raise RuntimeError("stop")
+        assert [layer.scaling[name] for layer, name in active_lora(model)] == scalings
+        assert torch.equal(depth(model), before)
+    model.base_model.disable_adapter_layers()
+    with scale_comes_back(model):
+        set_adapter_scale(model, 1)
+    assert torch.equal(depth(model), depth(tiny_model()))  # it was off
+    model.base_model.enable_adapter_layers()
+    model.merge_adapter()
+    with pytest.raises(ValueError, match="merged"), scale_comes_back(model):
+        pass
 
 
 def test_scale_refusals(model):

@@ -160,7 +160,7 @@ def test_the_dial_goes_from_base_to_adapter(backbone, head, tmp_path):
     out = deploy_onnx(adapter, tmp_path / "out", dial=True)
     for backend in ("onnx", "openvino"):
         predictor = Predictor(out, backend)
-        for scale in (0.0, 0.35, 1.0):
+        for scale in (-1.0, 0.0, 0.35, 1.0):
             model = DepthModel.from_pretrained(tmp_path / "base", adapter, scale)
             x = pixels(2, 84, 56)
             error = relative(predictor.predict(x.numpy(), scale), model.predict(x).numpy())

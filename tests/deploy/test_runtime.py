@@ -168,6 +168,8 @@ def test_a_dial_brings_the_base_along(folder, photo, tmp_path):
     assert np.allclose(half, 1.5 * base, atol=1e-5) and np.abs(base).max() > 0.1
     full = DeployedModel(out).depth_at(photo)
     assert np.allclose(full, 2 * base, atol=1e-5)
+    behind = DeployedModel(out, adapter_scale=-0.75).depth_at(photo)  # the layer dial goes on below the base
+    assert np.allclose(behind, 0.25 * base, atol=1e-5)
 
 
 @pytest.mark.parametrize("dial", [True, False])
@@ -274,7 +276,7 @@ def test_bad_scales_and_sizes(folder, photo):
     plain, dialed = folder(name="plain"), folder(name="dialed", dial=True)
     with pytest.raises(ValueError, match="its adapter scale is fixed"):
         DeployedModel(plain, adapter_scale=0.5)
-    for scale in (-0.1, 1.1, float("nan")):
+    for scale in (-1.1, 1.1, float("nan")):
         with pytest.raises(ValueError, match="from 0"):
             DeployedModel(dialed, adapter_scale=scale)
     with pytest.raises(ValueError, match="multiples of 14"):

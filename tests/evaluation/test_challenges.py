@@ -1,10 +1,12 @@
 """The challenges on Booster: stricter factors, what they rank by, and metric depth in centimeters."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
 from helpers.booster_tree import write_predictions, write_root
+from helpers.tiny import tiny_processor
 
 from gift_peft import align, depth_metrics, evaluate_booster
 from gift_peft.evaluation.booster_scenes import find_booster, read_ground_truth
@@ -66,6 +68,20 @@ def test_metric_depth_in_centimeters_by_hand(tmp_path):
         assert factor * own == pytest.approx(other, rel=1e-9)
     report.save(tmp_path / "out")
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["unit"] == "cm"
+
+
+def test_a_model_of_unknown_unit_under_a_metric_protocol_is_told(tmp_path):
+    write_root(tmp_path, scenes=1, images=1)
+    options = {"size": (56, 70), "processor": tiny_processor(), "kind": "depth", "progress": False}
+
+    def depth(pixels):
+        return 800 + pixels.mean(1)
+
+    with pytest.warns(UserWarning, match=r"ntire26 fits no scale, and nothing says that this model predicts metres"):
+        evaluate_booster(tmp_path, depth, protocol="ntire26", resize=1.0, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        evaluate_booster(tmp_path, depth, protocol="ntire26", resize=1.0, prediction_scale=1, **options)
 
 
 def test_protocols_name_what_they_rank_by():

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from gift_peft import evaluate_layered_depth, evaluate_md3k, get_gift_model, save_adapter, set_adapter_scale
+from gift_peft.adapters.scale import active_lora, adapter_scale
 from gift_peft.cli import main
 from gift_peft.evaluation.orderings import OrderingReport, count_right
 from gift_peft.models.loading import DepthModel
@@ -224,6 +225,29 @@ def test_md3k_of_an_adapter_and_its_dial(tmp_path, capsys):
         evaluate_md3k(tmp_path / "md3k", loaded, dial=[math.nan], progress=False)
 
 
+def test_a_dial_that_stops_leaves_the_adapter_as_it_was(tmp_path, monkeypatch):
+    write_md3k(tmp_path / "md3k", size=(56, 70))
+    network = get_gift_model(tiny_model(), rank=6, head="lora")
+    set_adapter_scale(network, 0.3)
+    scalings = [layer.scaling[name] for layer, name in active_lora(network)]
+    model = DepthModel(network, tiny_processor(), size="56x70")
+    depth_at = DepthModel.depth_at
+
+    def failing(self, *args, **options):
+        if adapter_scale(self.network) < 0:
+            raise ValueError("a photo that cannot be read")
+        return depth_at(self, *args, **options)
+
+    monkeypatch.setattr(DepthModel, "depth_at", failing)
+    with pytest.raises(ValueError, match="cannot be read"):
+        evaluate_md3k(tmp_path / "md3k", model, dial=[1, -1], progress=False)
+    assert [layer.scaling[name] for layer, name in active_lora(network)] == scalings
+    network.merge_adapter()
+    with pytest.raises(ValueError, match="the adapter is merged into the base"):
+        evaluate_md3k(tmp_path / "md3k", model, dial=[0], progress=False)
+    assert all(layer.merged for layer, _ in active_lora(network)), "refused before its base was predicted"
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -240,6 +264,26 @@ def test_annotations_of_another_schema_are_named(tmp_path, change, match):
     (tmp_path / "annotations.json").write_text(json.dumps({"images/a.png": [entry | (change or {})]}))
     with pytest.raises(ValueError, match=match):
         evaluate_md3k(tmp_path, predictions=tmp_path, kind="depth", progress=False)
+
+
+def test_files_that_begin_with_a_byte_order_mark(tmp_path):
+    Image.new("RGB", (3, 2)).save(tmp_path / "a.png")
+    text = json.dumps({"a.png": [pair([0, 0], [1, 0], "near", "near")]})
+    (tmp_path / "annotations.json").write_text(text, encoding="utf-8-sig")
+    np.save(tmp_path / "a.npy", DEPTH)
+    assert evaluate_md3k(tmp_path, predictions=tmp_path, kind="depth", progress=False).summary["sra1"] == 1
+    (tmp_path / "pairs_layer1_val").mkdir()
+    lines = tmp_path / "pairs_layer1_val" / "a.jsonl"
+    lines.write_text("[[0, 0, 1], [1, 0, 1]]\n\n", encoding="utf-8-sig")
+    options = {"predictions": tmp_path, "kind": "depth", "partial": True, "progress": False}
+    assert evaluate_layered_depth(tmp_path, **options).summary["pairs"] == 1
+
+
+@pytest.mark.parametrize("options", [["--protocol", "gift"], ["--prediction-scale", "2"]])
+def test_what_aligns_depth_is_no_option_of_an_order(options, tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["evaluate", "--md3k", str(tmp_path), "--base", str(tmp_path), *options])
+    assert "ask for an order alone" in capsys.readouterr().err
 
 
 def test_roots_without_md3k_are_named(tmp_path):

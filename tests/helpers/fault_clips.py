@@ -42,7 +42,7 @@ class FaultClip:
     made: str = ""
 
 
-class _Film:
+class Film:
     """Frames on their way, with the light and the noise of one camera."""
 
     def __init__(self, size, rng, mask) -> None:
@@ -125,7 +125,7 @@ def make_fault_clip(seed: int, stills, folder: Path, fault: str | None, size=Non
     shown = distinct(pictures, mask, rng, int(rng.integers(3, 6)))
     shown = [at_size(picture, size).astype(np.float32) for picture in shown]
     mask = at_size(mask.astype(np.uint8) * 255, size) > 127
-    film = _Film(size, rng, mask)
+    film = Film(size, rng, mask)
     clip = FaultClip(folder / f"{seed}.mp4", mask, fault)
     place = int(rng.integers(1, len(shown))) if fault else None
     told = [f"{size[1]}x{size[0]} noise {film.noise:.1f} drift {film.drift:+.3f} rate {film.rate:.0f}"]
@@ -163,7 +163,7 @@ def make_fault_clip(seed: int, stills, folder: Path, fault: str | None, size=Non
     return clip
 
 
-def _good_view(film: _Film, clip: FaultClip, picture, passing=True) -> None:
+def _good_view(film: Film, clip: FaultClip, picture, passing=True) -> None:
     held = film.hold(picture, float(film.rng.uniform(1.0, 2.0)))
     clip.views.append(held)
     clip.good.append(held)
@@ -171,7 +171,7 @@ def _good_view(film: _Film, clip: FaultClip, picture, passing=True) -> None:
         clip.good.append(film.hold(picture, float(film.rng.uniform(0.6, 1.2))))
 
 
-def _spoil(film: _Film, fault: str, before, view) -> tuple[np.ndarray, str, float]:
+def _spoil(film: Film, fault: str, before, view) -> tuple[np.ndarray, str, float]:
     """The view with the fault, what it is, and by how many pixels the camera stays away from where it was."""
     rng, larger = film.rng, max(1.0, film.size[1] / 640)
     if fault == "moved":

@@ -1,6 +1,10 @@
 """Bases of other packages: through stand-ins of their interfaces, and through the packages where installed."""
 
+import pickle
+import subprocess
 import sys
+import venv
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -13,9 +17,11 @@ from transformers import DPTConfig, DPTForDepthEstimation, DPTImageProcessorPil
 
 from gift_peft import evaluate_booster
 from gift_peft.evaluation.verb import run_evaluation
+from gift_peft.models.external import INSTALL_DA3
 from gift_peft.models.loading import DepthModel
 from gift_peft.predict import predict_images
 from gift_peft.reports.report import run_report
+from gift_peft.rules import UNKNOWN
 
 RAMP = torch.linspace(1, 2, 98)
 
@@ -68,6 +74,10 @@ def packages(monkeypatch):
             raise TypeError("__init__() missing 1 required positional argument: 'neck'")
         if name == "broken":
             raise KeyError("model_config")
+        if name == "text":
+            raise pickle.UnpicklingError("Weights only load failed.\nmore lines")
+        if name == "letter":
+            raise KeyError(101)
         return StandInMoGe(metric=True)
 
     def model_class(load):
@@ -101,6 +111,8 @@ def test_moge_is_asked_without_its_mask(packages, name, unit):
     assert loaded.kind == "depth" and loaded.millimeters_per_unit == unit
     pixels = torch.rand(3, 3, 70, 98)
     torch.testing.assert_close(loaded.predict(pixels), 3 * pixels.mean(1) + RAMP)
+    depth = 3 * pixels.mean(1) + RAMP  # against proxies, what its own mask leaves out does not count
+    torch.testing.assert_close(loaded.predict_proxies(pixels), depth.masked_fill(depth <= 2, UNKNOWN))
     white = loaded.inputs([Image.new("RGB", (50, 40), "white")])
     assert (white == 1).all()  # colours from 0 to 1: it normalises them itself
 
@@ -152,6 +164,10 @@ def test_what_is_missing_or_wrong_is_one_line(packages, monkeypatch):
         DepthModel.from_pretrained("da3:nowhere")
     with pytest.raises(ValueError, match=r"^base moge:broken: 'model_config'$"):
         DepthModel.from_pretrained("moge:broken")
+    with pytest.raises(ValueError, match=r"^base moge:text: Weights only load failed\.$"):
+        DepthModel.from_pretrained("moge:text")
+    with pytest.raises(ValueError, match=r"^base moge:letter: not a file of weights \(101\)$"):
+        DepthModel.from_pretrained("moge:letter")
     with pytest.raises(ValueError, match="base moge:known: an adapter needs a model of transformers"):
         DepthModel.from_pretrained("moge:known", adapter="somewhere")
     with pytest.raises(ValueError, match=r"size 71x98: both sides must be positive multiples of the patch size 14"):
@@ -160,6 +176,11 @@ def test_what_is_missing_or_wrong_is_one_line(packages, monkeypatch):
         monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
         with pytest.raises(ValueError, match=rf"^base {name}:known: .*pip install"):
             DepthModel.from_pretrained(f"{name}:known")
+
+
+def test_the_docs_say_how_to_install_depth_anything_3():
+    text = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()
+    assert all(f"  {line}\n" in text for line in INSTALL_DA3)
 
 
 # ---- architectures of transformers without a recipe ----
@@ -235,3 +256,49 @@ def test_the_real_depth_anything_3(tmp_path):
     with torch.no_grad():
         expected = torch.stack([network.model(image[None, None])["depth"][0, 0] for image in pixels])
     torch.testing.assert_close(loaded.predict(pixels), expected)
+
+
+DA3_BESIDE_US = """
+import sys, types, importlib.machinery
+import numpy, torch
+from transformers import DPTImageProcessorPil
+from gift_peft.models.loading import DepthModel
+import gift_peft.adapters.folder
+try:
+    import torchvision.transforms
+except (ImportError, RuntimeError):  # its wheel is of another torch; the package takes it for reading pictures alone
+    for name in [name for name in sys.modules if name.startswith("torchvision")]:
+        del sys.modules[name]
+    for name in ("torchvision", "torchvision.transforms"):
+        sys.modules[name] = types.ModuleType(name)
+        sys.modules[name].__spec__ = importlib.machinery.ModuleSpec(name, None)
+    made = sys.modules["torchvision"].transforms = sys.modules["torchvision.transforms"]
+    made.Compose = made.Normalize = made.ToTensor = lambda *args, **options: None
+from depth_anything_3.api import DepthAnything3
+torch.manual_seed(0)
+network = DepthAnything3(model_name="da3-small").eval()
+network.save_pretrained(sys.argv[1])
+loaded = DepthModel.from_pretrained(f"da3:{sys.argv[1]}", size="70x98")
+pixels = torch.rand(2, 3, 70, 98)
+with torch.no_grad():
+    expected = torch.stack([network.model(image[None, None])["depth"][0, 0] for image in pixels])
+torch.testing.assert_close(loaded.predict(pixels), expected)
+assert int(numpy.__version__.split(".")[0]) >= 2 and loaded.kind == "depth"
+"""
+
+
+@pytest.mark.slow
+def test_depth_anything_3_runs_beside_us_as_documented(tmp_path):
+    """In a fresh environment that sees what is installed here; torchvision's wheel may be for another torch."""
+    venv.create(tmp_path / "env", with_pip=True)
+    python = tmp_path / "env" / "bin" / "python"
+    here = [path for path in sys.path if path.endswith("site-packages")] + [str(Path(__file__).parents[2] / "src")]
+    site = next((tmp_path / "env" / "lib").glob("python*/site-packages"))
+    (site / "here.pth").write_text("\n".join(here) + "\n")
+    for line in INSTALL_DA3:
+        words = [word for word in line.split()[1:] if word != "torchvision"]  # with it pip would bring another torch
+        done = subprocess.run([python, "-m", "pip", words[0], "-q", *words[1:]], capture_output=True, text=True)
+        if done.returncode:
+            pytest.skip(f"the package index does not answer: {done.stderr.strip().splitlines()[-1]}")
+    done = subprocess.run([python, "-c", DA3_BESIDE_US, str(tmp_path / "da3")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

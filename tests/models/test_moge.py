@@ -20,6 +20,7 @@ from gift_peft.models.moge import MogeConfig, MogeForDepthEstimation, MogeImageP
 from gift_peft.models.moge.configuration_moge import VARIANTS
 from gift_peft.models.moge.geometry_moge import recover_shift
 from gift_peft.models.moge.package_moge import INSTALL
+from gift_peft.training.speed import checkpoint_blocks, compile_blocks
 
 __all__ = ["tiny_vit"]  # a fixture
 
@@ -188,6 +189,31 @@ def test_the_recipe_leaves_mask_and_normals_frozen(name, saved, tiny_vit):
         assert torch.equal(model(pixels).predicted_depth, base.predicted_depth)
         with model.disable_adapter():
             assert torch.equal(model(pixels).predicted_depth, base.predicted_depth)
+
+
+@pytest.mark.parametrize("name", ["v1", "v2-normal"])
+def test_its_blocks_are_computed_again_or_compiled(name, tiny_vit, monkeypatch):
+    pixels = images(2, 3, 42, 56)
+
+    def step(change):
+        torch.manual_seed(0)
+        model = get_gift_model(tiny_moge(name=name), rank=2)
+        change(model)
+        kept = []
+        with torch.autograd.graph.saved_tensors_hooks(lambda x: kept.append(x.numel()) or x, lambda x: x):
+            depth = model(pixel_values=pixels).predicted_depth
+        depth.mean().backward()
+        return depth, {key: own.grad for key, own in model.named_parameters() if own.grad is not None}, sum(kept)
+
+    depth, gradients, kept = step(lambda model: None)
+    assert any(gradient.any() for key, gradient in gradients.items() if "lora_" in key)
+    again, others, fewer = step(checkpoint_blocks)
+    assert torch.equal(again, depth) and others.keys() == gradients.keys() and fewer < kept
+    assert all(torch.equal(others[key], own) for key, own in gradients.items())
+    assert tiny_moge(name=name).supports_gradient_checkpointing
+    real = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda function, **options: real(function, backend="eager", **options))
+    torch.testing.assert_close(step(compile_blocks)[0], depth)
 
 
 # ---- official checkpoints ----

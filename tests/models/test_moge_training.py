@@ -8,16 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.adapted import depth, trained
 from helpers.moge import tiny_moge, tiny_vit
 from helpers.runs import arguments
 from helpers.tiny import write_raw_tree
 from peft import PeftModel
 from transformers import AutoModelForDepthEstimation
 
-from gift_peft import evaluate_gift_i, gift_loss, load_gift_i
+from gift_peft import evaluate_gift_i, get_gift_model, gift_loss, load_gift_i, save_adapter
 from gift_peft.dataset.loader import PreparedGroups, PreparedImages
 from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.dataset.tensors import collate_group
+from gift_peft.deploy.merged import deploy_transformers
 from gift_peft.models.loading import DepthModel
 from gift_peft.models.moge import MogeImageProcessorPil
 from gift_peft.models.moge.package_moge import INSTALL
@@ -69,6 +71,22 @@ def test_what_the_mask_leaves_out_enters_neither_loss_nor_metrics(tiny_vit, tmp_
     plain = DepthModel.from_pretrained(write_base(tmp_path / "plain"), size=SIZE)
     pixels = group.pixel_values
     assert torch.equal(plain.predict_proxies(pixels), plain.predict_base(pixels))
+
+
+@pytest.mark.parametrize(("name", "head"), [("v1", "full"), ("v2-normal", "full"), ("v2-normal", "lora")])
+def test_an_adapter_is_deployed_as_a_plain_model(name, head, tiny_vit, tmp_path):
+    tiny_moge(name=name).save_pretrained(tmp_path / "base")
+    MogeImageProcessorPil().save_pretrained(tmp_path / "base")
+    adapted = trained(get_gift_model(tiny_moge(name=name), rank=2, head=head))
+    save_adapter(adapted, tmp_path / "adapter", str(tmp_path / "base"), processor=MogeImageProcessorPil(), size=SIZE)
+    deploy_transformers(tmp_path / "adapter", tmp_path / "merged")
+    merged = DepthModel.from_pretrained(tmp_path / "merged")
+    unit = 1 if name == "v1" else 1000
+    assert (merged.size, merged.kind, merged.millimeters_per_unit) == (SIZE, "depth", unit)
+    for size in (SIZE, (97, 61)):
+        pixels = torch.rand(2, 3, *size)
+        torch.testing.assert_close(merged.predict(pixels), depth(adapted, pixels), rtol=1e-3, atol=1e-4)
+        assert not torch.allclose(merged.predict(pixels), depth(tiny_moge(name=name), pixels), rtol=1e-2)
 
 
 def test_a_surface_run_takes_it(tiny_vit, tmp_path):

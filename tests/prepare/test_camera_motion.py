@@ -40,6 +40,19 @@ def test_turn_and_zoom_are_in_pixels_of_the_frame(size):
     assert apart.max() < 0.25 * max(size) / 320
 
 
+@pytest.mark.parametrize("pixels", [0, 2, 18])
+def test_a_mirror_over_half_of_the_picture_neither_hides_a_push_nor_makes_one(pixels):
+    mirror = np.zeros(SIZE, bool)
+    mirror[30:220, 60:290] = True  # 57 % of the picture; where it is, is not told
+    for seed in range(6):
+        first, second = (
+            np.where(mirror[..., None], scene(500 + 2 * seed + k, SIZE), scene(seed, SIZE)) for k in (0, 1)
+        )
+        motion = Anchor(noisy(first, seed)).motion(noisy(pushed(second.astype(np.float32), pixels), seed + 50))
+        assert np.allclose(motion.matrix[:2, 2], [0.8 * pixels, 0.6 * pixels], atol=0.8)
+        assert abs(motion.pixels - pixels) < 0.6
+
+
 def test_another_view_and_an_empty_one_have_no_motion():
     anchor = Anchor(noisy(scene(1, SIZE), 0))
     assert anchor.motion(noisy(scene(2, SIZE), 1)) is None

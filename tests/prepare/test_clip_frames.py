@@ -2,9 +2,11 @@
 
 import re
 
+import cv2
 import numpy as np
 import pytest
 from helpers.clips import Making, pushed, views
+from helpers.photos import scene
 
 from gift_peft.captures.clip import TimeInClip
 from gift_peft.prepare.clip_frames import choose_frames, read_frames
@@ -77,6 +79,44 @@ def test_a_push_of_the_camera_begins_a_new_group(tmp_path, pixels, known_mask):
     assert "the camera was moved" in choice.notes[0]
 
 
+@pytest.mark.parametrize("cut_by_border", [False, True])
+def test_after_a_push_the_target_is_looked_for_where_it_then_is(tmp_path, cut_by_border):
+    pictures, mask = views(3, SIZE, 2)
+    if cut_by_border:  # pushed into the picture, it goes on where the first pose did not look
+        mask = np.zeros(SIZE, bool)
+        mask[60:180, :120] = True
+        pictures = [np.where(mask[..., None], scene(70 + k, SIZE), pictures[0]) for k in range(2)]
+    made = Making(SIZE)
+    for picture in pictures:
+        made.hold(picture)
+    usual, other = (pushed(picture, 20) for picture in pictures)
+    for picture in (usual, usual, usual, other):
+        made.hold(picture)
+        made.cross(picture, (0, 30), 0.5)
+    choice = choose_frames([made.write(tmp_path / "a.mp4")], lambda size: mask)
+    first, second = (held(pose.frames, made.holds) for pose in choice.poses)
+    assert first == [0, 1] and len(second) == 2 and second[0] in (2, 3, 4) and second[1] == 5
+    assert len(choice.notes) == 1
+
+
+def test_a_short_rest_between_two_pushes_is_a_pose_and_a_slow_pass_is_none(tmp_path):
+    pictures, mask = views(3, SIZE, 4)
+    made = Making(SIZE, noise=1.0)
+    for pixels, seconds in ((0, 1.2), (6, 0.55), (12, 1.2)):
+        made.hold(pushed(pictures[0], pixels), seconds)
+    choice = choose_frames([made.write(tmp_path / "a.mp4")], lambda size: mask)
+    assert [held(pose.frames, made.holds) for pose in choice.poses] == [[0], [1], [2]]
+    soft = cv2.GaussianBlur(pictures[0], (0, 0), 6.0).astype(np.float32) * 0.6 + 50
+    passing = Making(SIZE, noise=0.5)
+    passing.hold(soft, 1.2)
+    for frame in range(8):
+        passing.add(pushed(soft, 8 + 0.2 * frame))
+    passing.hold(pushed(soft, 20), 1.2)
+    choice = choose_frames([passing.write(tmp_path / "b.avi", "MJPG")], lambda size: mask)
+    assert [held(pose.frames, passing.holds) for pose in choice.poses] == [[0], [1]]
+    assert "left out: a moment at" in choice.notes[0] and "alone in its pose" in choice.notes[0]
+
+
 def test_drifting_light_is_no_new_observation_and_no_motion(tmp_path):
     pictures, _ = views(4, SIZE, 1)
     made = Making(SIZE, drift=-0.05)
@@ -85,6 +125,17 @@ def test_drifting_light_is_no_new_observation_and_no_motion(tmp_path):
     made.hold(pictures[0], 2.0)
     choice = choose_frames([made.write(tmp_path / "a.mp4")])
     assert len(choice.poses) == 1 and len(choice.poses[0].frames) == 1
+
+
+def test_what_the_drifting_light_clips_stands_not_outside_the_target(tmp_path):
+    pictures, mask = views(2, SIZE, 4)
+    made = Making(SIZE, noise=1.0, drift=0.03)
+    for picture in pictures:
+        lamp = np.where(mask[..., None], picture, np.clip(0.8 * picture, 0, 200))
+        lamp[:60, :80] = np.where(mask[:60, :80, None], lamp[:60, :80], 225)
+        made.hold(lamp, 2.0)
+    choice = choose_frames([made.write(tmp_path / "a.mp4")], lambda size: mask)
+    assert held(choice.poses[0].frames, made.holds) == [0, 1, 2, 3] and choice.notes == []
 
 
 def test_the_most_different_are_taken_where_there_are_many(tmp_path):

@@ -3,11 +3,14 @@
 import pytest
 import torch
 from helpers.group_tools import SIZE, gift_model
+from helpers.moge import tiny_moge, tiny_vit
 from helpers.tiny import tiny_model
 from torch import nn
 
 from gift_peft.adapters.recipes import get_gift_model
 from gift_peft.training.precision import choose_precision, exact_output
+
+__all__ = ["tiny_vit"]  # a fixture
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda", 0)
 
@@ -62,6 +65,25 @@ def test_depth_ends_in_float32_under_autocast(head):
                 assert model(pixel_values=pixels).predicted_depth.dtype == torch.float32
     assert (before.dtype, after.dtype) == (torch.bfloat16, torch.float32)
     assert (after - exact).abs().mean() <= (before.float() - exact).abs().mean()
+
+
+@pytest.mark.parametrize("head", ["full", "lora", "none"])
+@pytest.mark.parametrize("name", ["v1", "v2-normal"])
+def test_points_and_their_scale_end_in_float32_too(name, head, tiny_vit):
+    """MoGe's depth is the third of three channels, times a scale of linear layers; its one channel is a mask."""
+    model = get_gift_model(tiny_moge(name=name), rank=2, head=head)
+    pixels = torch.rand(2, 3, 42, 56, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        exact = model(pixel_values=pixels).points
+        with torch.autocast("cpu", torch.bfloat16):
+            before = model(pixel_values=pixels).points
+        exact_output(model)
+        assert torch.equal(model(pixel_values=pixels).points, exact)
+        with torch.autocast("cpu", torch.bfloat16):
+            output = model(pixel_values=pixels)
+    for part in [output.points, *([output.metric_scale] if name == "v2-normal" else [])]:
+        assert (part.bfloat16().float() == part).float().mean() < 0.1, "it ended in bf16"
+    assert (output.points - exact).abs().mean() < 0.7 * (before - exact).abs().mean()
 
 
 def test_gradients_pass_and_autocast_comes_back_after_an_error():

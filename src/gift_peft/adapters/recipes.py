@@ -114,8 +114,8 @@ def get_gift_model(model: nn.Module, rank: int = 8, head: str = "full", recipe: 
     """Wrap a float32 depth model for GIFT; it starts as the base, to the bit.
 
     Args: `rank` of every LoRA; `head` "full" trains the recipe's `modules_to_save`, "lora" puts LoRA on their
-    convolutions and linears (transposed and grouped convolutions stay frozen: PEFT cannot merge them), "none" leaves
-    them frozen; `recipe` replaces the one for `config.model_type`.
+    convolutions and linears (transposed and grouped ones, and those that do not pad with zeros, stay frozen: PEFT
+    cannot merge them), "none" leaves them frozen; `recipe` replaces the one for `config.model_type`.
     The model's own dropout and drop-path rates are set to 0, because a replay must repeat its snapshot.
     Raises ValueError for a half-precision base, an unknown head, names that match nothing or too much, and LoRA
     options that break `disable_adapter()`.
@@ -192,8 +192,14 @@ def _lora_layers(model: nn.Module, roots: list[str]) -> list[str]:
         f"{root}.{name}" if name else root
         for root in roots
         for name, module in model.get_submodule(root).named_modules()
-        if isinstance(module, nn.Linear) or (isinstance(module, nn.Conv2d) and module.groups == 1)
+        if isinstance(module, nn.Linear) or (isinstance(module, nn.Conv2d) and _merges(module))
     ]
+
+
+def _merges(convolution: nn.Conv2d) -> bool:
+    """PEFT's own convolutions pad with zeros, and have no groups."""
+    pads_as_they_do = convolution.padding_mode == "zeros" or max(convolution.kernel_size) == 1
+    return convolution.groups == 1 and pads_as_they_do
 
 
 def _pattern(targets: str | list[str]) -> str:

@@ -5,6 +5,7 @@ That needs a base that the adapter leaves alone, which `check_lora_config` sees 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -40,11 +41,7 @@ def set_adapter_scale(model: nn.Module, scale: float) -> None:
     """
     if not math.isfinite(scale):
         raise ValueError(f"the adapter scale must be finite, got {scale}")
-    layers, wrappers = active_lora(model), active_saved_modules(model)
-    if not layers and not wrappers:
-        raise ValueError("the model has no active LoRA adapter to scale")
-    if any(layer.merged for layer, _ in layers):
-        raise ValueError("the adapter is merged into the base: unmerge it before changing its scale")
+    layers, wrappers = _scalable_parts(model)
     for config in getattr(model, "peft_config", {}).values():
         check_lora_config(config)
     trained = [_trained_state(wrapper, name) for wrapper, name in wrappers]  # checks all before changing any
@@ -55,6 +52,37 @@ def set_adapter_scale(model: nn.Module, scale: float) -> None:
         layer.set_scale(name, scale)
     for (wrapper, name), state in zip(wrappers, trained, strict=True):
         _scale_saved_module(wrapper, name, state, scale)
+
+
+@contextlib.contextmanager
+def scale_comes_back(model: nn.Module) -> Iterator[None]:
+    """Inside, `set_adapter_scale` may be called at will; afterwards, whatever happened, all is as it was, to the bit.
+
+    Raises ValueError, at once, for a model without or with a merged adapter.
+    """
+    layers, wrappers = _scalable_parts(model)
+    scale, scalings = adapter_scale(model), [layer.scaling[name] for layer, name in layers]
+    off = [module for module, _ in (*layers, *wrappers) if module.disable_adapters]
+    try:
+        yield
+    finally:
+        set_adapter_scale(model, scale)
+        for (layer, name), scaling in zip(layers, scalings, strict=True):
+            layer.scaling[name] = scaling
+        for module in off:
+            module.enable_adapters(False)
+
+
+def _scalable_parts(
+    model: nn.Module,
+) -> tuple[list[tuple[LoraLayer, str]], list[tuple[ModulesToSaveWrapper, str]]]:
+    """(active LoRA, active modules that are trained in full); ValueError without an adapter, or with a merged one."""
+    layers, wrappers = active_lora(model), active_saved_modules(model)
+    if not layers and not wrappers:
+        raise ValueError("the model has no active LoRA adapter to scale")
+    if any(layer.merged for layer, _ in layers):
+        raise ValueError("the adapter is merged into the base: unmerge it before changing its scale")
+    return layers, wrappers
 
 
 def adapter_scale(model: nn.Module) -> float:

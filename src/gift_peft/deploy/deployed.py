@@ -16,7 +16,8 @@ class DeployedModel:
     Args:
         folder: of `gift-peft deploy --to onnx`, `openvino` or `int8`.
         backend (`str`, *optional*): `onnx` or `openvino`; default what the folder was made for.
-        adapter_scale (`float`, *optional*): of a model with a dial, 0 is the base and 1 (default) the adapter.
+        adapter_scale (`float`, *optional*): of a model with a dial, 0 is the base and 1 (default) the adapter; below
+            0, to -1, the adapter is turned the other way.
 
     Attributes:
         size (`tuple[int, int]`): (height, width) at the network.
@@ -36,8 +37,9 @@ class DeployedModel:
         if adapter_scale is not None:
             if not self.predictor.has_dial:
                 raise ValueError(f"{folder} was exported without --dial: its adapter scale is fixed")
-            if not 0 <= adapter_scale <= 1:
-                raise ValueError(f"adapter scale {adapter_scale:g}: it goes from 0 (the base) to 1 (the adapter)")
+            if not -1 <= adapter_scale <= 1:
+                ends = "0 (the base) to 1 (the adapter), or down to -1"
+                raise ValueError(f"adapter scale {adapter_scale:g}: it goes from {ends}")
         settings = self.predictor.settings
         self.size, self.kind, self.adapted = self.predictor.size, settings["kind"], self.predictor.has_dial
         self.millimeters_per_unit = settings.get("millimeters_per_unit") or 1.0

@@ -68,8 +68,8 @@ class Predictor:
     def predict(self, pixel_values: np.ndarray, scale: float | None = None) -> np.ndarray:
         """Pixel values (B,3,h,w) float32 to predictions (B,h,w) float32, in the model's units.
 
-        Any batch, and sides that are multiples of `multiple_of` in preprocess.json. `scale`, from 0 (the base) to 1
-        (the adapter, default), where the model has a dial. Raises ValueError.
+        Any batch, and sides that are multiples of `multiple_of` in preprocess.json. `scale`, where the model has a
+        dial: 0 is the base, 1 (default) the adapter, down to -1 it is turned the other way. Raises ValueError.
         """
         return self._session.run(self.inputs(pixel_values, scale))
 
@@ -122,8 +122,9 @@ class Predictor:
         feeds = {self.settings["input"]["name"]: values}
         if self.has_dial:
             scale = 1.0 if scale is None else scale
-            if not 0 <= scale <= 1:
-                raise ValueError(f"adapter scale {scale:g}: it goes from 0 (the base) to 1 (the adapter)")
+            if not -1 <= scale <= 1:
+                ends = "0 (the base) to 1 (the adapter), or down to -1"
+                raise ValueError(f"adapter scale {scale:g}: it goes from {ends}")
             feeds[self.settings["dial"]["name"]] = np.array([scale], np.float32)
         elif scale is not None:
             raise ValueError("this model was exported without a dial: its adapter scale is fixed")

@@ -124,7 +124,7 @@ def _against(
         kind = model.kind or "depth" if reference == "proxy" else model.known_kind()
         if reference == "depth" and protocol.space == "native" and kind == "inverse_depth":
             raise ValueError(f'protocol {protocol.name} would fit inverse depth straight to depth; use "gift"')
-        scale = prediction_scale or (1.0 if protocol.fits_scale else model.millimeters_per_unit)
+        scale = prediction_scale or _unit_of(model, protocol)
         in_mm = reference == "depth"
         tasks[reference] = Task(models, protocol, kind, scale, NO_DEPTH if in_mm else NO_PROXY, in_mm)
 
@@ -210,7 +210,7 @@ def evaluate_booster(
         kind = depth_model.known_kind()
         predictors = _predictors(depth_model, baseline, batch_size)
         models = [*predictors]
-        scale = prediction_scale or (1.0 if rules.fits_scale else depth_model.millimeters_per_unit)
+        scale = prediction_scale or _unit_of(depth_model, rules)
 
         def predict(scene: BoosterScene, truth: GroundTruth) -> Iterable[dict[str, Any]]:
             return predict_scene(scene, truth, depth_model, predictors)
@@ -244,6 +244,19 @@ def evaluate_booster(
         "predictions": predictions and str(predictions),
     }
     return report
+
+
+def _unit_of(model: DepthModel, rules: Protocol) -> float:
+    """mm per unit of a model's predictions; 1 where a scale is fitted, or, with a warning, where nothing says it."""
+    if rules.fits_scale:
+        return 1.0
+    if model.millimeters_per_unit == 1:
+        warnings.warn(
+            f"protocol {rules.name} fits no scale, and nothing says that this model predicts metres: its numbers are "
+            "taken for mm; prediction_scale (--prediction-scale) says what one unit is",
+            stacklevel=4,
+        )
+    return model.millimeters_per_unit
 
 
 def _stored_kind(kind: str | None, rules: Protocol) -> str:

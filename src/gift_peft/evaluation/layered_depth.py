@@ -132,7 +132,7 @@ def _read_questions(files: dict[str, Path]) -> dict[str, np.ndarray]:
 def _read_tuples(path: Path, count: int) -> np.ndarray:
     """(T, count, 2) points of a file; ValueError naming file and line."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: damaged ({reason(error)})") from None
     tuples = []

@@ -79,7 +79,7 @@ def read_md3k(root: str | Path) -> list[PhotoQuestions]:
     if not path.is_file():
         raise FileNotFoundError(f"MD-3k root {root}: {ANNOTATIONS} is missing; expected it beside images/")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: damaged ({reason(error)})") from None
     if not isinstance(content, dict) or not content:

@@ -4,8 +4,9 @@ A question is a list of points of one photo; it is answered right if predicted d
 is right / all over the questions of all photos. `layered_depth` and `md3k` beside it read the data.
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from gift_peft.adapters.scale import scale_comes_back, set_adapter_scale
 from gift_peft.evaluation.alignment import resize_prediction, to_numpy
 from gift_peft.evaluation.results import write_results
 from gift_peft.evaluation.stored_predictions import find_stored, read_stored, require_stored
@@ -138,8 +140,8 @@ def evaluate_orderings(
     of these scales as well, and has its own scale again afterwards.
 
     Raises:
-        ValueError: neither or both of model and predictions, no kind, a dial without an adapter or with a scale that
-            is not finite, no question at all, NaN in a prediction (naming the photo).
+        ValueError: neither or both of model and predictions, no kind, a dial without an adapter, with a merged one or
+            with a scale that is not finite, no question at all, NaN in a prediction (naming the photo).
         FileNotFoundError: a photo or a stored prediction that is missing.
     """
     if (model is None) == (predictions is None):
@@ -159,7 +161,10 @@ def evaluate_orderings(
         kind, predictors = depth_model.known_kind(), _predictors(depth_model)
     if dial and (depth_model is None or not hasattr(depth_model.network, "disable_adapter")):
         raise ValueError("the layer dial turns an adapter: name one")
-    rows = _answers(photos, predictors, kind, progress, "evaluate")
+    # A merged adapter is refused before the base is predicted, which would unmerge it.
+    with scale_comes_back(depth_model.network) if dial and depth_model else contextlib.nullcontext():
+        rows = _answers(photos, predictors, kind, progress, "evaluate")
+        turned = [(scale, _turn(photos, depth_model, kind, scale, progress)) for scale in dial]
     subsets = list(dict.fromkeys(name for photo in photos for name in photo.questions))
     counts: dict[str, Any] = {"photos": len(photos)}
     for name in ("questions", "outside"):
@@ -170,10 +175,6 @@ def evaluate_orderings(
     def summary(answers: list[dict], name: str) -> dict:
         return derive({subset: _accuracy(answers, name, subset) for subset in subsets})
 
-    turned = []
-    if dial:
-        for scale, answers in _turn(photos, depth_model, kind, dial, progress):
-            turned.append({"scale": scale} | summary(answers, "adapted"))
     adapted = "adapted" in predictors
     return OrderingReport(
         dataset=dataset,
@@ -181,7 +182,7 @@ def evaluate_orderings(
         base=summary(rows, "base") if adapted else None,
         counts=counts,
         adapted=adapted,
-        dial=turned,
+        dial=[{"scale": scale} | summary(answers, "adapted") for scale, answers in turned],
         notes=list(notes),
         rows=rows,
         about={"kind": kind, "predictions": predictions and str(predictions)},
@@ -239,17 +240,7 @@ def _accuracy(rows: list[dict], model: str, subset: str) -> float:
     return sum(row[model].get(subset, 0) for row in rows) / counted if counted else math.nan
 
 
-def _turn(
-    photos: Sequence[PhotoQuestions], model: Any, kind: str, scales: Sequence[float], progress: bool
-) -> Iterator[tuple[float, list[dict]]]:
-    """(scale, rows) of the adapter at each scale; afterwards it has scale 1 again, or the one that was asked for."""
-    from gift_peft.adapters.scale import adapter_scale, set_adapter_scale
-
-    before = adapter_scale(model.network)
-    predictors = {"adapted": lambda photo: model.depth_at(photo.path)}
-    try:
-        for scale in scales:
-            set_adapter_scale(model.network, scale)
-            yield scale, _answers(photos, predictors, kind, progress, f"scale {scale:+g}")
-    finally:
-        set_adapter_scale(model.network, before)
+def _turn(photos: Sequence[PhotoQuestions], model: Any, kind: str, scale: float, progress: bool) -> list[dict]:
+    """Rows of the adapter at a scale."""
+    set_adapter_scale(model.network, scale)
+    return _answers(photos, {"adapted": lambda photo: model.depth_at(photo.path)}, kind, progress, f"scale {scale:+g}")

@@ -194,6 +194,8 @@ def run(argv: Sequence[str]) -> int:
         parser.error("--predictions go with a benchmark, and without --adapter")
     if args.dial is not None and (not args.adapter or named[0] not in ("layereddepth", "md3k")):
         parser.error("--dial turns an --adapter on --md3k or --layereddepth")
+    if named[0] in ("layereddepth", "md3k") and (args.protocol or args.prediction_scale):
+        parser.error("--protocol and --prediction-scale align depth; --layereddepth and --md3k ask for an order alone")
     names = ("adapter_scale", "size", "kind", "revision", "out", "predictions", "accept_base")
     model = {name: getattr(args, name) for name in names}
     if named[0] in ("layereddepth", "md3k"):

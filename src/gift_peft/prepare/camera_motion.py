@@ -2,7 +2,8 @@
 
 Direct alignment in place of tracked corners, which soft and noisy frames hardly have: Gauss-Newton over all pixels, on
 brightness freed of local mean and contrast. Residuals are judged by tiles, and tiles that show something else than the
-rest agrees on lose their weight, so that a target that changes does not pull, known or not.
+rest agrees on lose their weight, so that a target that changes does not pull, known or not. Of several starts that one
+wins whose motion explains most of the picture, so that a mirror over half of it neither hides a motion nor makes one.
 """
 
 from dataclasses import dataclass
@@ -17,10 +18,12 @@ TILES = 16  # along the longer side
 COARSE, STEPS = 4, 12  # first at a quarter of the resolution; Gauss-Newton steps at most at each
 LEAST_SIDE = 16  # pixels of the shorter side at the coarse resolution
 MAX_STEP, SETTLED = 4.0, 0.01  # pixels at that resolution
-AGREEING = 0.3  # correlation of the tiles after the motion, on average by the energy of their gradients
+EXPLAINED = 0.15  # share of the structure that a motion explains; what comes of another scene stays below
+CLEARLY = 0.5  # from which no other start is tried
 SURE = 3.0  # times its own expected error, by which a motion exceeds 0
 STILL_PRIOR = 1e-4  # of the whole gradient energy: directions in which nothing can be seen stay at 0
-START_SHIFT = 1.5  # pixels at the coarse resolution, from which a shift found by phase correlation is a start as well
+PEAKS, STARTS = 8, 2  # of the phase correlation that are looked at, and that are starts
+PEAK_WIDTH = 1.2  # pixels by which a small turn or zoom smears a peak
 
 
 @dataclass(frozen=True)
@@ -42,11 +45,11 @@ class Motion:
 class _Fit:
     shift: np.ndarray  # (4,): right, down, and what the picture's longer half-side adds to them by zoom and by turn
     covariance: np.ndarray
-    agreeing: float
+    explained: float
 
 
-def _agreeing(fit: _Fit) -> float:
-    return fit.agreeing
+def _explained(fit: _Fit) -> float:
+    return fit.explained
 
 
 class _Level:
@@ -73,11 +76,11 @@ class _Level:
         return np.column_stack([linear, middle + shift[:2] - linear @ middle])
 
     def fit(self, there: np.ndarray, shift: np.ndarray, steps: int) -> _Fit:
-        """The motion to the frame's structure `there`: of those on the way from `shift` on, what agrees best."""
+        """The motion to the frame's structure `there`: of those on the way from `shift`, what explains most."""
         best = None
         for _ in range(steps):
             found, step = self._look(there, shift)
-            if best is None or found.agreeing > best.agreeing:
+            if best is None or found.explained > best.explained:
                 best = found
             if np.abs(step).max() < SETTLED:
                 break
@@ -86,18 +89,20 @@ class _Level:
 
     def _look(self, there: np.ndarray, shift: np.ndarray) -> tuple[_Fit, np.ndarray]:
         """What is to be said of a motion, and the step to a better one."""
-        gradients, pulls, weights, correlation = self._tiles(there, shift)
+        gradients, pulls, weights, correlation, overlap = self._tiles(there, shift)
         normal = np.einsum("t,tji,tjk,tkl->il", weights, self.geometry, gradients, self.geometry)
         normal += (STILL_PRIOR * np.trace(gradients.sum(axis=0)) + 1e-9) * np.eye(4)
         # Its error by how the tiles disagree, not by the residuals' variance: neighboring residuals are alike.
         scores = np.einsum("t,tji,tj->ti", weights, self.geometry, pulls)
         inverse = np.linalg.inv(normal)
         energy = gradients[:, 0, 0] + gradients[:, 1, 1]
-        agreeing = float((energy * np.clip(correlation, 0, 1)).sum() / max(energy.sum(), 1e-9))
-        return _Fit(shift, inverse @ (scores.T @ scores) @ inverse, agreeing), inverse @ scores.sum(axis=0)
+        explained = overlap * float((energy * np.square(np.clip(correlation, 0, 1))).sum() / max(energy.sum(), 1e-9))
+        return _Fit(shift, inverse @ (scores.T @ scores) @ inverse, explained), inverse @ scores.sum(axis=0)
 
     def _tiles(self, there: np.ndarray, shift: np.ndarray):
-        """Of each tile: gradients' products (2, 2), what pulls at the motion (2,), its weight, its correlation."""
+        """Of each tile: gradients' products (2, 2), what pulls at the motion (2,), its weight, its correlation; and
+        the share of the anchor that the frame shows.
+        """
         size, matrix, flags = self.image.shape[::-1], self.matrix(shift), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         frame = cv2.warpAffine(there, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         counts = self.usable * cv2.warpAffine(np.ones_like(there), matrix, size, flags=flags)
@@ -114,7 +119,8 @@ class _Level:
         mismatch = residual / (energy + 1e-6)  # as square pixels
         usual = weighted_quantile(mismatch, energy, 0.3)
         weights = 1 / np.square(1 + mismatch / (2 * usual + 1e-6))
-        return gradients, np.stack([gx_apart, gy_apart], 1), weights, both / np.sqrt(own * others + 1e-9)
+        overlap = float(counts.sum()) / max(float(self.usable.sum()), 1.0)
+        return gradients, np.stack([gx_apart, gy_apart], 1), weights, both / np.sqrt(own * others + 1e-9), overlap
 
     def _mean(self, image: np.ndarray) -> np.ndarray:
         return cv2.resize(image, self.tiles, interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
@@ -146,22 +152,33 @@ class Anchor:
         there = _structure(self._small(pixels))
         coarse, fine = self.levels
         near = _quarter(there)
-        fits = [coarse.fit(near, start, STEPS) for start in self._starts(near)]
-        best = max(fits, key=_agreeing).shift * COARSE
-        starts = [best, np.zeros(4)] if np.abs(best).max() > 1 else [best]  # a large target misleads at low resolution
-        fit = max((fine.fit(there, start, STEPS) for start in starts), key=_agreeing)
-        if not np.isfinite(fit.shift).all() or fit.agreeing < AGREEING:
+        roughly = coarse.fit(near, np.zeros(4), STEPS).shift * COARSE
+        starts = [roughly, np.zeros(4)] if np.abs(roughly).max() > 1 else [roughly]
+        fit = max((fine.fit(there, start, STEPS) for start in starts), key=_explained)
+        if fit.explained < CLEARLY:  # a large motion, or a large target
+            others = [start for start in self._starts(there) if 2 * start.explained > fit.explained]
+            fit = max([fit, *(fine.fit(there, start.shift, STEPS) for start in others)], key=_explained)
+        if not np.isfinite(fit.shift).all() or fit.explained < EXPLAINED:
             return None
         return self._whole(fit)
 
-    def _starts(self, there: np.ndarray) -> list[np.ndarray]:
-        """No motion, and a large one if there is a sign of it; both in coarse pixels."""
-        window = cv2.createHanningWindow(there.shape[::-1], cv2.CV_32F)
-        shift, _ = cv2.phaseCorrelate(self.levels[0].image, there, window)
-        starts = [np.zeros(4)]
-        if np.hypot(*shift) > START_SHIFT:
-            starts.append(np.array([*shift, 0, 0]))
-        return starts
+    def _starts(self, there: np.ndarray) -> list[_Fit]:
+        """Shifts of which there is a sign, the best first.
+
+        A target that shows something else can have a stronger peak than the camera's motion, so several are tried, and
+        at the fine resolution, where chance has weaker peaks.
+        """
+        fine = self.levels[1]
+        window = np.outer(*(_taper(side) for side in there.shape))
+        product = np.conj(np.fft.rfft2(fine.image * fine.usable * window)) * np.fft.rfft2(there * window)
+        peaks = np.fft.irfft2(product / (np.abs(product) + 1e-9), there.shape).astype(np.float32)
+        peaks = cv2.GaussianBlur(np.fft.fftshift(peaks), (0, 0), PEAK_WIDTH)
+        shifts = []
+        for _ in range(PEAKS):
+            y, x = np.unravel_index(int(np.argmax(peaks)), peaks.shape)
+            peaks[max(y - COARSE, 0) : y + COARSE + 1, max(x - COARSE, 0) : x + COARSE + 1] = -np.inf
+            shifts.append(np.array([x - there.shape[1] // 2, y - there.shape[0] // 2, 0, 0], float))
+        return sorted((fine.fit(there, shift, 1) for shift in shifts), key=_explained, reverse=True)[:STARTS]
 
     def _whole(self, fit: _Fit) -> Motion:
         """In pixels of the frame."""
@@ -182,6 +199,11 @@ class Anchor:
 def _structure(gray: np.ndarray) -> np.ndarray:
     # With the target: what it shows is another motion at most, and its mask's edge would not move with the camera.
     return normalize_contrast(gray, np.ones(gray.shape, bool))
+
+
+def _taper(count: int) -> np.ndarray:
+    """(count,) 1, and less in the outer eighths: what lies around a large target must count."""
+    return np.minimum(1, (0.5 + np.minimum(np.arange(count), np.arange(count)[::-1])) * 8 / count).astype(np.float32)
 
 
 def _quarter(image: np.ndarray) -> np.ndarray:

@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gift_peft.captures.clip import Clip, ClipFrame, TimeInClip
-from gift_peft.prepare.camera_motion import Anchor
+from gift_peft.prepare.camera_motion import SURE, Anchor
 from gift_peft.prepare.registration import warp
 from gift_peft.prepare.still_moments import QUIET, Look, Moment, Stillness
 from gift_peft.prepare.stillness import (
@@ -27,8 +28,10 @@ from gift_peft.prepare.stillness import (
 MOST_LOOKS = 48  # moments of one pose that are remembered; of the two most alike one goes
 OTHER_SHARE, OTHER_CELLS = 0.02, 3  # of the target's cells that differ between two observations at least
 FOREIGN_CELLS = 0.004  # share of the cells outside the target that may differ from the other moments'
+WHITE = 230  # grey levels of a cell, part of which may be clipped
 MOVED = 0.0008  # mean motion over the diagonal, above which the camera was moved; at least a pixel
-LONE = 0.6  # seconds of stillness that a pose with a single view must have to be a group of its own
+LONE = 0.6  # seconds of stillness from which a pose with a single view is a group of its own, whatever moves in it
+RESTS = 0.1  # of what counts as moved: a camera that moves less within a brief moment stands still in it
 REFERENCE_NEAR = 1.0  # seconds from the time that is stated to the still moment that it means
 
 
@@ -150,6 +153,7 @@ class _Found:
     look: Look
     start: float
     end: float
+    rests: bool = True  # the camera stands, and does not pass slowly
 
     @property
     def chosen(self) -> Chosen:
@@ -160,71 +164,150 @@ class _Found:
         return self.end - self.start
 
 
+class _Stand:
+    """What is seen from one pose: its moments, where the target is in it, and what later moments are compared with.
+
+    Args:
+        matrix (`np.ndarray`, *optional*): (3, 3), pixels of the first pose to this one's; None where not known.
+        mask (`np.ndarray`, *optional*): (H, W) bool, the target in the first pose.
+        pixels (`np.ndarray`): (H, W, 3) uint8, the first moment's.
+    """
+
+    def __init__(self, matrix: np.ndarray | None, mask: np.ndarray | None, pixels: np.ndarray) -> None:
+        self.matrix, self.moments = matrix, []
+        unknown = mask
+        if mask is not None and matrix is not None and (here := warp(mask, matrix)).any():
+            # Where the first pose did not look the target may go on: a mirror is often cut by the picture's border.
+            mask, unknown = here, here | ~warp(np.ones_like(mask), matrix)
+        self.inside = None if mask is None else cells_inside(mask)[0]
+        self.outside = None if unknown is None else cells_inside(unknown)[1]
+        self.anchor: Anchor | None = Anchor(pixels, unknown)
+
+    def is_another_view(self, found: _Found) -> bool:
+        region = self.outside
+        changed = difference(found.look.cells, self.moments[0].look.cells, region) > 2 * OTHER_CONTENT
+        return float(changed[region].mean() if region is not None else changed.mean()) > STRUCTURE_CHANGED
+
+    def remember(self, found: _Found) -> None:
+        self.moments.append(found)
+        if len(self.moments) > MOST_LOOKS:
+            # Of the newest and the one most like it, that with less detail goes.
+            *others, new = self.moments
+            near = min(others, key=lambda found: float(self._changes(found, new).mean()))
+            self.moments.remove(min(near, new, key=lambda found: found.look.detail))
+
+    def choose(self, treated: _Found | None, most: int, threshold: float) -> tuple[list[_Found], list[str]]:
+        """Those that differ most, each observation once, in the order of time; and what was left out.
+
+        `threshold` is the grey levels above which a cell shows something else.
+        """
+        moments, notes = self._without_foreign([found for found in self.moments if found is not treated], threshold)
+        if treated is not None:
+            moments = [found for found in moments if self._differs(found, treated, self.inside, threshold)]
+        if not moments:
+            return [], notes
+        target = self.inside if self.inside is not None else self._changing(moments, threshold)
+        chosen = [max(moments, key=lambda found: found.look.detail)]
+        left = [found for found in moments if found is not chosen[0]]
+        nearest = {id(found): self._apart(found, chosen[0], target) for found in left}
+        while left and len(chosen) < most:
+            left = [found for found in left if self._differs(found, chosen[-1], target, threshold)]
+            if not left:
+                break
+            farthest = max(left, key=lambda found: nearest[id(found)])
+            chosen.append(farthest)
+            left.remove(farthest)
+            for found in left:
+                nearest[id(found)] = min(nearest[id(found)], self._apart(found, farthest, target))
+        return sorted(chosen, key=lambda found: (found.clip, found.look.index)), notes
+
+    def _changes(self, found: _Found, other: _Found) -> np.ndarray:
+        return difference(found.look.cells, other.look.cells, self.outside)
+
+    def _apart(self, found: _Found, other: _Found, target: np.ndarray) -> float:
+        return float(self._changes(found, other)[target].mean())
+
+    def _differs(self, found: _Found, other: _Found, target: np.ndarray | None, threshold: float) -> bool:
+        changes = self._changes(found, other)
+        changed = (changes if target is None else changes[target]) > threshold
+        return int(changed.sum()) >= max(OTHER_CELLS, OTHER_SHARE * (0 if target is None else target.sum()))
+
+    def _changing(self, moments: list[_Found], threshold: float) -> np.ndarray:
+        """(h, w) bool: the cells that change in the pose at all; all of them where none do."""
+        usual = moments[len(moments) // 2]
+        changed = np.zeros(usual.look.cells.shape[:2], bool)
+        for found in moments:
+            changed |= self._changes(found, usual) > threshold
+        return changed if changed.any() else np.ones_like(changed)
+
+    def _without_foreign(self, moments: list[_Found], threshold: float) -> tuple[list[_Found], list[str]]:
+        """Without moments in which something stands outside the target that most others do not show."""
+        if self.outside is None or self.outside.sum() < 30 or len(moments) < 3:
+            return moments, []
+        usual = np.median([found.look.cells for found in moments], axis=0).astype(np.float32)
+        limit = max(OTHER_CELLS, FOREIGN_CELLS * self.outside.sum())
+        kept, notes = [], []
+        for found in moments:
+            foreign = difference(found.look.cells, usual, self.outside) > 3 * threshold
+            # What is nearly white in both says nothing: the light that drifts has clipped it in one of them.
+            white = np.minimum(found.look.cells, usual).max(axis=2) > WHITE
+            told = self.outside & (cv2.dilate(white.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+            if foreign[told].sum() <= limit:
+                kept.append(found)
+            else:
+                notes.append(f"left out: at {found.look.seconds:.1f} s something stands outside the target")
+        # If all differ there, it is what the target does to its surroundings, or their own change.
+        return (moments, []) if 2 * len(kept) <= len(moments) else (kept, notes)
+
+
 class _Scene:
     """Sorts the moments of a stream into poses."""
 
     def __init__(self, size: tuple[int, int], mask: np.ndarray | None, most: int) -> None:
         self.size, self.mask, self.most = size, mask, most
-        self.inside, self.outside = (None, None) if mask is None else cells_inside(mask)
         self.notes: list[str] = []
         self.noise = 1.0
         self.moved = max(1.0, MOVED * float(np.hypot(*size)))
-        self.anchor: Anchor | None = None
-        self.matrix: np.ndarray | None = np.eye(3)
-        self.poses: list[tuple[np.ndarray | None, list[_Found]]] = []
-        self.now: list[_Found] = []
+        self.stands: list[_Stand] = []
 
     def take(self, clip: int, moment: Moment | None, noise: float) -> None:
         if moment is None:
             return
         self.noise = noise
         found = _Found(clip, moment.best, moment.start, moment.end)
-        if self.anchor is None:
-            self.anchor = Anchor(moment.pixels, self.mask)
+        if found.lasted < LONE:
+            passed = Anchor(moment.first).motion(moment.last)
+            seen = passed is not None and SURE * passed.error < self.moved
+            found.rests = seen and passed.pixels <= max(RESTS * self.moved, SURE * passed.error)
+        if not self.stands:
+            self._stand(np.eye(3), moment.pixels)
         else:
-            motion = self.anchor.motion(moment.pixels)
-            if motion is not None and motion.pixels > self.moved:
-                self._next_pose(moment.pixels, motion.matrix)
-            elif motion is None and self._is_another_view(found):
-                self._next_pose(moment.pixels, None)
-        self.now.append(found)
-        if len(self.now) > MOST_LOOKS:
-            self._forget_one()
+            now = self.stands[-1]
+            motion = now.anchor.motion(moment.pixels)
+            if motion is not None and motion.pixels > max(self.moved, SURE * motion.error):
+                self._stand(None if now.matrix is None else motion.matrix @ now.matrix, moment.pixels)
+            elif motion is None and now.is_another_view(found):
+                self._stand(None, moment.pixels)
+        self.stands[-1].remember(found)
 
-    def _is_another_view(self, found: _Found) -> bool:
-        region = self.outside
-        changed = difference(found.look.cells, self.now[0].look.cells, region) > 2 * OTHER_CONTENT
-        return float(changed[region].mean() if region is not None else changed.mean()) > STRUCTURE_CHANGED
-
-    def _next_pose(self, pixels: np.ndarray, matrix: np.ndarray | None) -> None:
-        self.poses.append((self.matrix, self.now))
-        self.now = []
-        self.matrix = None if matrix is None or self.matrix is None else matrix @ self.matrix
-        self.anchor = Anchor(pixels, self._mask_here())
-
-    def _mask_here(self) -> np.ndarray | None:
-        """The target's mask in the present pose, roughly where the pose is not known."""
-        return self.mask if self.mask is None or self.matrix is None else warp(self.mask, self.matrix)
-
-    def _forget_one(self) -> None:
-        """Of the newest and the one most like it, that with less detail."""
-        *others, new = self.now
-        near = min(others, key=lambda found: float(self._changes(found, new).mean()))
-        self.now.remove(min(near, new, key=lambda found: found.look.detail))
+    def _stand(self, matrix: np.ndarray | None, pixels: np.ndarray) -> None:
+        if self.stands:
+            self.stands[-1].anchor = None  # it is compared with no more
+        self.stands.append(_Stand(matrix, self.mask, pixels))
 
     def finish(self, reference: TimeInClip | None, at: int | None, clips: Sequence[Path]) -> list[Pose]:
-        if self.now:
-            self.poses.append((self.matrix, self.now))
         treated = None if reference is None else self._treated(reference, at, clips)
         poses = []
-        for matrix, moments in self.poses:
-            frames = self._choose([found for found in moments if found is not treated], treated)
-            pose = Pose([found.chosen for found in frames], matrix)
-            if treated in moments:
+        for stand in self.stands:
+            frames, notes = stand.choose(treated, self.most, change_above(self.noise, OTHER_CONTENT))
+            self.notes += notes
+            pose = Pose([found.chosen for found in frames], stand.matrix)
+            if treated in stand.moments:
                 owner = pose if frames or not poses else poses[-1]
                 owner.reference = treated.chosen
-            brief = len(frames) == 1 and sum(found.lasted for found in moments) < LONE
-            if brief and len(self.poses) > 1 and pose.reference is None:
+            brief = len(frames) == 1 and sum(found.lasted for found in stand.moments) < LONE
+            brief = brief and not any(found.rests for found in stand.moments)
+            if brief and len(self.stands) > 1 and pose.reference is None:
                 self.notes.append(
                     f"left out: a moment at {frames[0].look.seconds:.1f} s, alone in its pose of the camera"
                 )
@@ -240,7 +323,7 @@ class _Scene:
 
     def _treated(self, reference: TimeInClip, at: int, clips: Sequence[Path]) -> _Found:
         """The moment that the reference's time means."""
-        moments = [found for _, pose in self.poses for found in pose if found.clip == at]
+        moments = [found for stand in self.stands for found in stand.moments if found.clip == at]
 
         def distance(found: _Found) -> float:
             return max(found.start - reference.seconds, reference.seconds - found.end, 0.0)
@@ -252,66 +335,3 @@ class _Scene:
                 f"is; it takes {QUIET:g} s without motion"
             )
         return nearest
-
-    def _choose(self, moments: list[_Found], treated: _Found | None) -> list[_Found]:
-        """Those that differ most, each observation once, in the order of time."""
-        moments = self._without_foreign(moments)
-        if treated is not None:
-            moments = [found for found in moments if self._differs(found, treated, self.inside)]
-        if not moments:
-            return []
-        target = self.inside if self.inside is not None else self._changing(moments)
-        chosen = [max(moments, key=lambda found: found.look.detail)]
-        left = [found for found in moments if found is not chosen[0]]
-        nearest = {id(found): self._apart(found, chosen[0], target) for found in left}
-        while left and len(chosen) < self.most:
-            left = [found for found in left if self._differs(found, chosen[-1], target)]
-            if not left:
-                break
-            farthest = max(left, key=lambda found: nearest[id(found)])
-            chosen.append(farthest)
-            left.remove(farthest)
-            for found in left:
-                nearest[id(found)] = min(nearest[id(found)], self._apart(found, farthest, target))
-        return sorted(chosen, key=lambda found: (found.clip, found.look.index))
-
-    def _changes(self, found: _Found, other: _Found) -> np.ndarray:
-        return difference(found.look.cells, other.look.cells, self.outside)
-
-    def _apart(self, found: _Found, other: _Found, target: np.ndarray) -> float:
-        return float(self._changes(found, other)[target].mean())
-
-    def _differs(self, found: _Found, other: _Found, target: np.ndarray | None) -> bool:
-        changes = self._changes(found, other)
-        changed = (changes if target is None else changes[target]) > self._content_threshold
-        return int(changed.sum()) >= max(OTHER_CELLS, OTHER_SHARE * (0 if target is None else target.sum()))
-
-    @property
-    def _content_threshold(self) -> float:
-        return change_above(self.noise, OTHER_CONTENT)
-
-    def _changing(self, moments: list[_Found]) -> np.ndarray:
-        """(h, w) bool: the cells that change in the pose at all; all of them where none do."""
-        usual = moments[len(moments) // 2]
-        changed = np.zeros(usual.look.cells.shape[:2], bool)
-        for found in moments:
-            changed |= self._changes(found, usual) > self._content_threshold
-        return changed if changed.any() else np.ones_like(changed)
-
-    def _without_foreign(self, moments: list[_Found]) -> list[_Found]:
-        """Without moments in which something stands outside the target that most others do not show."""
-        if self.outside is None or self.outside.sum() < 30 or len(moments) < 3:
-            return moments
-        usual = np.median([found.look.cells for found in moments], axis=0).astype(np.float32)
-        limit = max(OTHER_CELLS, FOREIGN_CELLS * self.outside.sum())
-        kept, notes = [], []
-        for found in moments:
-            foreign = difference(found.look.cells, usual, self.outside)[self.outside] > 3 * self._content_threshold
-            if foreign.sum() <= limit:
-                kept.append(found)
-            else:
-                notes.append(f"left out: at {found.look.seconds:.1f} s something stands outside the target")
-        if 2 * len(kept) <= len(moments):
-            return moments  # all differ there: it is what the target does to its surroundings, or their own change
-        self.notes += notes
-        return kept

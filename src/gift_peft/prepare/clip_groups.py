@@ -26,7 +26,7 @@ from gift_peft.prepare.job import Job
 from gift_peft.prepare.out_folder import side_by_side
 from gift_peft.prepare.registration import warp
 
-CHOOSING = 1  # a new number chooses the frames of every clip again
+CHOOSING = 2  # a new number chooses the frames of every clip again
 CHOSEN = ".chosen.json"  # digest, notes, and {group: what is wrong with it, or null}
 MASK_LEFT = 0.5  # share of the mask that must stay in the picture where the camera was moved
 

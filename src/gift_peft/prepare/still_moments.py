@@ -33,12 +33,18 @@ class Look:
 
 @dataclass
 class Moment:
-    """A still stretch. `best` is its sharpest frame that counts; None while it is too short."""
+    """A still stretch. `best` is its sharpest frame that counts; None while it is too short.
+
+    Pixels are (H, W, 3) uint8, of the best frame, of the first and, once it has ended, of the last before its end
+    may have begun; whoever takes the moment drops them soon.
+    """
 
     start: float
     end: float
     best: Look | None = None
-    pixels: np.ndarray | None = None  # of the best frame; whoever takes the moment drops them soon
+    pixels: np.ndarray | None = None
+    first: np.ndarray | None = None
+    last: np.ndarray | None = None
 
 
 class Stillness:
@@ -77,7 +83,7 @@ class Stillness:
         if not self.still:
             return self._finish() or ended
         if self.moment is None:
-            self.moment, self._first = Moment(before.seconds, seconds), look.cells
+            self.moment, self._first = Moment(before.seconds, seconds, first=pixels), look.cells
         self.moment.end = seconds
         look.detail = detail_of(pixels)
         self._waiting.append((look, pixels))
@@ -127,6 +133,8 @@ class Stillness:
 
     def _finish(self) -> Moment | None:
         moment, self.moment, self._first = self.moment, None, None
+        if moment is not None and self._waiting:
+            moment.last = self._waiting[0][1]
         self._waiting.clear()
         long_enough = moment is not None and moment.best is not None and moment.end - moment.start >= QUIET
         return moment if long_enough else None

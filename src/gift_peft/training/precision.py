@@ -5,6 +5,7 @@ thousandth of the work, is therefore left in float32; VGGT and Metric3D leave th
 """
 
 import os
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -32,9 +33,18 @@ def choose_precision(asked: str | None, device: torch.device, say: Callable[[str
 
 
 def exact_output(model: nn.Module) -> None:
-    """Leave convolutions that give depth itself, one channel, in float32 under autocast; else nothing changes."""
-    for module in model.modules():
-        if isinstance(module, nn.Conv2d) and module.out_channels == 1:
+    """Leave what gives depth itself in float32 under autocast; else nothing changes.
+
+    Convolutions of one channel; or, where a network has `depth_outputs`, the convolutions and linear layers in whose
+    names this regular expression is found: MoGe's depth is one of three channels, and its one channel is a mask.
+    """
+    named = next((module.depth_outputs for module in model.modules() if hasattr(module, "depth_outputs")), None)
+    for name, module in model.named_modules():
+        if named is None:
+            gives_depth = isinstance(module, nn.Conv2d) and module.out_channels == 1
+        else:
+            gives_depth = isinstance(module, nn.Conv2d | nn.Linear) and re.search(str(named), name)
+        if gives_depth:
             hooks = _OutOfAutocast()
             module.register_forward_pre_hook(hooks.leave)
             module.register_forward_hook(hooks.enter, always_call=True)

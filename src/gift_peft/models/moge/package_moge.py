@@ -2,9 +2,12 @@
 
 import importlib
 import warnings
+from functools import cache
 from typing import Any
 
+from torch import nn
 from transformers import initialization as init
+from transformers.modeling_layers import GradientCheckpointingLayer
 
 # Its metadata asks for opencv-python, torchvision and gradio, which a network does not use and which would replace
 # what is installed: without dependencies, and scipy, which its geometry imports.
@@ -27,6 +30,16 @@ def build_network(version: str, arguments: dict[str, Any]) -> Any:
         # The released checkpoints state arguments that the package no longer has.
         warnings.filterwarnings("ignore", "The following deprecated/invalid arguments", UserWarning)
         try:
-            return module.MoGeModel(**arguments)
+            network = module.MoGeModel(**arguments)
         except (TypeError, KeyError, AttributeError, IndexError) as error:
             raise ValueError(f"no MoGe {version} network has these sizes ({error})") from None
+    for block in (network.backbone if version == "v1" else network.encoder.backbone).blocks:
+        block.__class__ = _recomputable(block.__class__)
+    return network
+
+
+@cache
+def _recomputable(block_class: type[nn.Module]) -> type[nn.Module]:
+    """The class of a transformer block as one that transformers (and the training here) can compute again."""
+    members = {"__module__": block_class.__module__, "__doc__": block_class.__doc__}
+    return type(block_class.__name__, (GradientCheckpointingLayer, block_class), members)

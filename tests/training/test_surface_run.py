@@ -121,7 +121,11 @@ def test_the_first_row_is_the_base(whole, groups):
 
 
 def test_the_target_is_learned(base_dir, tree, tmp_path):
-    train(arguments(base_dir, tree, tmp_path / "out", **SURFACE | {"flip": False, "color_jitter": 0.0}, num_train_epochs=12))
+    train(
+        arguments(
+            base_dir, tree, tmp_path / "out", **SURFACE | {"flip": False, "color_jitter": 0.0}, num_train_epochs=12
+        )
+    )
     rows = rows_of(tmp_path / "out")
     assert rows[-1]["consistency"] < 0.8 * rows[0]["consistency"]
 

@@ -57,7 +57,6 @@ def part(groups: list[Observed], which: str | int) -> list[Observed]:
 
 TRAIN = (("train", "all"),)
 OLD = (("validation", "all"),)
-BOTH = (*TRAIN, ("singles", 318))
 MANY = (*TRAIN, ("singles", 1000))
 FRESH = (("fresh_1", "all"), ("fresh_2", "all"), ("fresh_3", "all"))
 UNSEEN = (("fresh_4", "all"), ("fresh_5", "all"), ("fresh_6", "all"))  # rendered after FRESH had been looked at
@@ -102,7 +101,6 @@ STAGES = {
         report("mean shift alone", rule=Rule("shift")),
         report("true depth (upper bound)", rule=Rule("truth")),
         report("fills alone", rule=Rule(observations=False)),
-        report("paper's objective, lambda_c 1.4", **PAPER | {"lambda_c": 1.4}),
         report("plane for all", rule=Rule("plane")),
         report("quantile for all", rule=Rule("quantile")),
         report("fills alone, plane", rule=Rule("plane", observations=False)),
@@ -126,7 +124,6 @@ STAGES = {
     # What true depth as the target does not reach either: more photos, more updates.
     "more": [
         report("surface targets, 24 epochs", epochs=24),
-        Trial("groups and 318 single photos, 18 epochs", BOTH, FRESH, **CHOSEN | {"epochs": 18}),
     ],
     # Four times the scenes, and other light; the older validation groups choose, the sets after them report.
     "many": [
@@ -147,6 +144,5 @@ STAGES = {
         first("consensus lambda_c 1.4 8 epochs", **PAPER | {"lambda_c": 1.4}, epochs=8),
         first("consensus flips 8 epochs", **PAPER | {"flips": True}, epochs=8),
         first("consensus rate 4e-4 8 epochs", **PAPER, rate=4e-4, epochs=8),
-        first("consensus lambda_c 2 8 epochs", **PAPER | {"lambda_c": 2.0}, epochs=8),
     ],
 }

@@ -133,7 +133,7 @@ def test_moge_is_right_at_every_size(name, config, tiny_vit, tmp_path):
     for backend in ("onnx", "openvino"):
         predictor = Predictor(out, backend)
         assert_right(predictor, model)
-        assert predictor.settings["kind"] == "depth" and predictor.settings["unit"] == "metres"
+        assert predictor.settings["kind"] == "depth" and predictor.settings["unit"] == "depth in meters"
 
 
 @pytest.mark.slow
@@ -147,6 +147,6 @@ def test_moge_with_a_dial(tiny_vit, tmp_path):
 @pytest.mark.slow
 def test_the_first_version_is_refused_and_nothing_is_left(tiny_vit, tmp_path):
     adapter = adapter_of("v1", tmp_path)
-    with pytest.raises(ValueError, match="the first version of MoGe is not exported: .*take --to transformers, or"):
+    with pytest.raises(ValueError, match=r"the first version of MoGe is not exported: .*take --to transformers, or"):
         deploy_onnx(adapter, tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["adapter", "base"]

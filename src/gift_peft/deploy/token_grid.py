@@ -23,9 +23,9 @@ GRID = "token_grid"
 
 
 def tokens_of(network: nn.Module) -> int | None:
-    """How many tokens a network divides any picture into; None for one whose tokens are the picture's own patches.
+    """How many tokens a network divides any picture into; None where they are the picture's own patches.
 
-    Raises ValueError for the first version of MoGe: it cuts fractions of pixels off, in float64, of picture by picture.
+    Raises ValueError for the first version of MoGe: it cuts off fractions of pixels that it worked out in float64.
     """
     inner = getattr(network, "network", None)
     if not isinstance(inner, MogeForDepthEstimation):
@@ -61,12 +61,12 @@ def linspace(start: Any, end: Any, steps: Any, *, dtype: Any = None, device: Any
     first, last = scalar(start, like), scalar(end, like)
     step = (last - first) / scalar(steps - 1, like).clamp(min=1)
     index = torch.arange(steps, device=device)
-    half = torch.where(index < steps // 2, first + step * index, last - step * (steps - 1 - index))
-    return half.to(like.dtype)
+    points = torch.where(index < steps // 2, first + step * index, last - step * (steps - 1 - index))
+    return points.to(like.dtype)
 
 
 def positions(self: Any, x: Tensor, h: Any, w: Any) -> Tensor:
-    """As the vision transformer's `interpolate_pos_encoding(x, h, w)`: its table (1,1+M*M,C), resampled to h/14 x w/14.
+    """As the vision transformer's `interpolate_pos_encoding`: its table (1,1+M*M,C), resampled to h/14 x w/14.
 
     The table is taken as it is for its own grid; for others the step is that of a grid larger by `interpolate_offset`.
     """

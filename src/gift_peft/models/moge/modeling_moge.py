@@ -23,6 +23,32 @@ from .configuration_moge import MogeConfig
 from .geometry_moge import recover_shift
 from .package_moge import build_network
 
+UNUSED = ("backbone.mask_token",)  # of pre-training; some files leave it out
+
+
+@dataclass
+class MogeDepthEstimatorOutput(DepthEstimatorOutput):
+    """
+    Args:
+        predicted_depth (`torch.Tensor` of shape `(B, H, W)`): metres with a scale head, else of unknown scale. Finite
+            everywhere; where `valid_mask` is False it means nothing.
+        valid_mask (`torch.Tensor` of shape `(B, H, W)`, *optional*): bool, the network's own: False for sky, and for
+            what else it takes for infinitely far.
+        points (`torch.Tensor` of shape `(B, H, W, 3)`): x, y, z as the network gives them, before shift and scale.
+        normals (`torch.Tensor` of shape `(B, H, W, 3)`, *optional*): unit normals.
+        metric_scale (`torch.Tensor` of shape `(B,)`, *optional*): metres per unit of the points.
+        focal, shift (`torch.Tensor` of shape `(B,)`): of the camera, over half the picture's diagonal, and along z in
+            the points' unit.
+    """
+
+    valid_mask: torch.Tensor | None = None
+    points: torch.Tensor | None = None
+    normals: torch.Tensor | None = None
+    metric_scale: torch.Tensor | None = None
+    focal: torch.Tensor | None = None
+    shift: torch.Tensor | None = None
+
+
 class _TokenGrid:
     """Stands where MoGe-2 takes a number of tokens, n, and gives the rows and columns that are asked for.
 
@@ -48,32 +74,6 @@ class _TokenSide:
 
     def __round__(self) -> int:
         return self.count
-
-
-UNUSED = ("backbone.mask_token",)  # of pre-training; some files leave it out
-
-
-@dataclass
-class MogeDepthEstimatorOutput(DepthEstimatorOutput):
-    """
-    Args:
-        predicted_depth (`torch.Tensor` of shape `(B, H, W)`): metres with a scale head, else of unknown scale. Finite
-            everywhere; where `valid_mask` is False it means nothing.
-        valid_mask (`torch.Tensor` of shape `(B, H, W)`, *optional*): bool, the network's own: False for sky, and for
-            what else it takes for infinitely far.
-        points (`torch.Tensor` of shape `(B, H, W, 3)`): x, y, z as the network gives them, before shift and scale.
-        normals (`torch.Tensor` of shape `(B, H, W, 3)`, *optional*): unit normals.
-        metric_scale (`torch.Tensor` of shape `(B,)`, *optional*): metres per unit of the points.
-        focal, shift (`torch.Tensor` of shape `(B,)`): of the camera, over half the picture's diagonal, and along z in
-            the points' unit.
-    """
-
-    valid_mask: torch.Tensor | None = None
-    points: torch.Tensor | None = None
-    normals: torch.Tensor | None = None
-    metric_scale: torch.Tensor | None = None
-    focal: torch.Tensor | None = None
-    shift: torch.Tensor | None = None
 
 
 class MogeForDepthEstimation(PreTrainedModel):
@@ -171,7 +171,10 @@ class MogeForDepthEstimation(PreTrainedModel):
         if token_grid is not None:
             if self.config.version == "v1":
                 raise ValueError("token_grid: the first version of MoGe works its grid out of num_tokens alone")
-            tokens = _TokenGrid(*token_grid)
+            rows, columns = token_grid
+            if rows < 1 or columns < 1:
+                raise ValueError(f"token_grid must be positive rows and columns, got {token_grid}")
+            tokens = _TokenGrid(rows, columns)
         elif tokens < 1:
             raise ValueError(f"num_tokens must be positive, got {tokens}")
         output = self.network.forward(pixel_values, num_tokens=tokens)

@@ -177,6 +177,11 @@ def _places(path: Path) -> list[tuple]:
     return keys
 
 
+def printable(text: str) -> str:
+    """File names may hold bytes that are no text; what is told and sent may not."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 def is_leftover(name: str) -> bool:
     """Whether a file or folder of this name is passed over wherever a person's files are listed: hidden ones
     (`.DS_Store`, `._photo.jpg`, `.AppleDouble`), and those of `LEFTOVERS`.

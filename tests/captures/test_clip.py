@@ -134,7 +134,7 @@ def test_fewer_frames_than_stated_are_a_cut(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"not a video at all" * 50, None])
-def test_what_is_no_clip_is_named(tmp_path, content):
+def test_what_is_no_clip_is_named(tmp_path, capfd, content):
     path = tmp_path / "a.mp4"
     if content is None:
         whole = write(path).read_bytes()
@@ -142,7 +142,7 @@ def test_what_is_no_clip_is_named(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"a\.mp4: cannot be opened as a video") as caught:
         list(Clip(path).frames())
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value) and "WARN" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

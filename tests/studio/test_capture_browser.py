@@ -20,6 +20,12 @@ def clip(path, seed, count):
     return made.write(path)
 
 
+def dropped(tab, after="photo /"):
+    """Wait until the log says that a photo was dropped, and another one taken since; the strip shows it later."""
+    script = "after => new RegExp(`dropped .*${after}`).test(document.querySelector('#capture .log').textContent)"
+    tab.page.wait_for_function(script, arg=after)
+
+
 def fits(tab):
     return tab.page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
 
@@ -62,7 +68,7 @@ def test_photos_are_taken_one_is_dropped_and_the_mask_comes_next(browser, tmp_pa
         room.locator(".group").fill("")
         room.get_by_role("button", name="Start").click()
         room.get_by_role("button", name="Drop group_1/001.png").click()
-        room.get_by_role("button", name="Drop group_1/001.png").wait_for()  # of the next view
+        dropped(tab)  # and the next view was taken
         room.get_by_role("button", name="Draw the mask").click()
         tab.page.wait_for_function("document.querySelector('#masks .group').value === 'train/group_1'")
         tab.said("^Click on the mirror")
@@ -79,9 +85,9 @@ def test_keys_end_it_and_a_closed_tab_stops_the_camera(browser, tmp_path):
         room = tab.page.locator("#capture")
         room.get_by_role("button", name="Start").click()
         room.get_by_role("button", name="Drop group_1/001.png").click()  # and the keys are still the room's
-        room.locator(".log").get_by_text("dropped").wait_for()
+        dropped(tab, "")
         tab.page.keyboard.press("p")
-        room.locator(".strip li").first.wait_for()
+        dropped(tab)
         tab.page.keyboard.press("q")
         room.locator(".next").get_by_text("group_1: ").wait_for()
         room.get_by_role("button", name="Start").click()
@@ -92,3 +98,85 @@ def test_keys_end_it_and_a_closed_tab_stops_the_camera(browser, tmp_path):
         later.page.locator("#capture .next").get_by_text("group_2: ").wait_for()
         later.close()
     assert 1 <= len(list((raw / "group_2").iterdir())) < 12
+
+
+def contrast(tab, place):
+    """Of a text with what lies behind it (WCAG 2.2, 1.4.3: 4.5 at least)."""
+    script = """place => {
+        let behind = document.querySelector(place);
+        const text = getComputedStyle(behind).color;
+        while (getComputedStyle(behind).backgroundColor === "rgba(0, 0, 0, 0)") behind = behind.parentElement;
+        return [text, getComputedStyle(behind).backgroundColor].map((color) => color.match(/\\d+/g).slice(0, 3));
+    }"""
+    colors = np.array(tab.page.evaluate(script, place), float) / 255
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    light = sorted(linear @ [0.2126, 0.7152, 0.0722])
+    return (light[1] + 0.05) / (light[0] + 0.05)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_texts_in_color_can_be_read(browser, tmp_path, scheme):
+    source = clip(tmp_path / f"{'a_clip_of_a_long_name' * 5}.mp4", 3, 1)
+    with studio(tmp_path / "raw", "--source", source) as url:
+        tab = Watched(browser, url, width=390)
+        tab.page.emulate_media(color_scheme=scheme)
+        tab.page.reload()
+        room = tab.page.locator("#capture")
+        room.get_by_text("Set up the camera").wait_for()
+        box = room.locator(".source").bounding_box()
+        assert box["x"] + box["width"] <= 390
+        for place in (".next", ".wrong", ".enough dd", ".source"):
+            assert contrast(tab, f"#capture {place}") >= 4.5
+        room.locator(".next").evaluate("next => next.classList.add('warns')")
+        assert contrast(tab, "#capture .next") >= 4.5
+        tab.close()
+
+
+def test_impatient_fingers_and_a_masks_room_that_was_there_before(browser, tmp_path):
+    source, raw = clip(tmp_path / "a.mp4", 4, 12), tmp_path / "raw"
+    with studio(raw, "--source", source) as url:
+        tab, other = Watched(browser, url), Watched(browser, url)
+        room = tab.page.locator("#capture")
+        tab.page.get_by_role("tab", name="Masks").click()
+        tab.said("has no groups yet")
+        tab.page.get_by_role("tab", name="Capture").click()
+        room.get_by_role("button", name="Start").dblclick()
+        room.locator(".strip li").first.wait_for()
+        assert not room.locator(".wrong").is_visible()
+        for _ in range(20):
+            tab.page.keyboard.down("p")  # held: the browser repeats it
+        tab.page.keyboard.up("p")
+        room.locator(".log").get_by_text("the next still moment is a photo").first.wait_for()
+        assert room.locator(".log").get_by_text("the next still moment is a photo").count() == 1
+        tab.page.keyboard.press("q")
+        room.locator(".next").get_by_text("group_1: ").wait_for()
+        assert tab.page.evaluate("document.activeElement.classList.contains('next')")
+        other.page.locator("#capture .strip li").first.wait_for()
+        room.get_by_role("button", name="Start").click()
+        other.page.locator("#capture .next").get_by_text("Another tab of this studio").wait_for()
+        assert other.page.locator("#capture .strip li").count() == 0  # of which nothing can be dropped
+        room.locator(".strip li").first.wait_for()
+        tab.page.keyboard.press("q")
+        room.locator(".next").get_by_text("group_2: ").wait_for()
+        tab.page.get_by_role("tab", name="Masks").click()
+        tab.said("^Click on the mirror|Nothing can be compared")
+        assert tab.page.locator("#masks .group option").count() == 2
+        for one in (tab, other):
+            one.close()
+
+
+def test_a_studio_that_is_gone_is_told_and_found_again(browser, tmp_path):
+    source, raw = clip(tmp_path / "a.mp4", 4, 12), tmp_path / "raw"
+    with studio(raw, "--source", source) as url:
+        tab = Watched(browser, url)
+        room = tab.page.locator("#capture")
+        room.get_by_role("button", name="Start").click()
+        room.locator(".strip li").first.wait_for()
+    room.locator(".next").get_by_text("The studio does not answer: start it again.").wait_for()
+    assert not room.locator(".live").is_visible()
+    with studio(raw, "--source", source, "--port", url.rsplit(":", 1)[1]):
+        room.locator(".next").get_by_text("Set up the camera").wait_for()
+        assert room.locator(".group").get_attribute("placeholder") == "group_2"
+    tab.page.get_by_role("tab", name="Masks").click()
+    tab.said("^The studio does not answer")
+    tab.page.close()

@@ -234,3 +234,54 @@ def test_the_targets_border_stands_on_the_picture_and_not_on_the_photo(tmp_path,
     assert found["of"] == "target" and away[border].mean() > 3 * away[~mask].mean()
     assert np.abs(photo - pictures[0])[border].mean() < 10
     assert np.array_equal(np.asarray(Image.open(tmp_path / "raw/door/mask.png")) > 0, mask)
+
+
+def test_a_tab_that_is_closed_in_a_long_pause_of_a_clip_stops_it(tmp_path, camera, monkeypatch):
+    """Recorders of screens write no frame while nothing moves."""
+    monkeypatch.setattr(capture_room, "GONE", 0.3)
+    monkeypatch.setattr(capture_room, "PATIENCE", 0.05)
+
+    class Paused(Camera):
+        def frames(self):
+            frames = super().frames()
+            for frame in frames:
+                yield ClipFrame(frame.index, 3600.0 * frame.index, frame.pixels)
+
+    room = CaptureRoom(tmp_path / "raw", Paused("a.mp4", clip=object(), shown=camera.shown))
+    room.start({"tab": "a", "group": "door"})
+    assert until(room, stopped, "b")["said"][-1].endswith("the page was closed, and the camera is off")
+
+
+def test_it_says_that_the_camera_is_being_opened_and_closed(room, camera, monkeypatch):
+    opened, whole = threading.Event(), Camera.frames
+
+    def slow(self):
+        opened.wait(DEADLINE)
+        yield from whole(self)
+
+    monkeypatch.setattr(Camera, "frames", slow)
+    room.start({"tab": "a", "group": "door"})
+    found = room.look({"tab": "a"})
+    assert found["next"] == "The camera is being opened." and found["figures"]["drift"] == "-"
+    room.press({"tab": "a", "what": "end"})
+    assert room.look({"tab": "a"})["next"] == "The camera is being closed."
+    opened.set()
+    assert until(room, stopped)["wrong"].startswith("0: no photo was taken")
+
+
+def test_a_mask_that_was_drawn_is_not_asked_for(room, tmp_path):
+    room.start({"tab": "a", "group": "door"})
+    until(room, running)
+    room.press({"tab": "a", "what": "end"})
+    assert any(line.startswith("Draw the target") for line in until(room, stopped)["told"])
+    (tmp_path / "raw/door/mask.png").write_bytes(b"drawn")
+    assert not any(line.startswith("Draw the target") for line in room.look({"tab": "a"})["told"])
+
+
+def test_a_photo_that_somebody_deleted_has_no_picture(room, tmp_path, capfd):
+    room.start({"tab": "a", "group": "door"})
+    until(room, running)
+    room.close()
+    (tmp_path / "raw/door/001.png").unlink()
+    assert room.strip() == {"photos": [{"name": "door/001.png", "picture": None}]}
+    assert capfd.readouterr().err == ""

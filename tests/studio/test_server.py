@@ -168,3 +168,13 @@ def test_what_is_no_picture_reaches_the_room_too_which_says_so(tmp_path):
     assert photo.preprocess(given) == given.path and photo.preprocess(None) is None
     with pytest.raises(ValueError, match=r"notes\.png: not a readable image"):
         CompareRoom.compare(room, photo.preprocess(given), 1.0)
+
+
+def test_names_that_are_no_text_can_be_sent():
+    answer = server._answer(lambda request: {"caf\udce9": [request["name"], 3, None, {"picture": "é"}]})
+    assert answer({"name": "\ud800"}) == {r"caf\udce9": [r"\ud800", 3, None, {"picture": "é"}]}
+
+    def fails(request):
+        raise ValueError(request["name"])
+
+    assert server._answer(fails)({"name": "a\ud800"}) == {"error": r"a\ud800"}

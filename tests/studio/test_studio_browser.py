@@ -248,7 +248,7 @@ def test_targets_and_comparison(browser, tmp_path, fresh_cache):
 
 
 FAKE = """
-window.element = document;
+window.element = document.body;
 window.saves = [];
 window.waiting = [];
 const uri = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7";

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from helpers.tiny import write_group
+from PIL import Image
 
 from gift_peft.cli import main
 from gift_peft.prepare import proposals
@@ -163,6 +164,7 @@ def test_a_source_opens_the_capture_room_in_raw_or_a_new_folder(opened, tmp_path
         ("new", ["--source", "nowhere.mp4"], "nowhere.mp4: no such file"),
         ("new", ["--source", "nowhere"], "nowhere: neither a camera's number"),
         ("new", ["--source", "0", "--mask", "m.png"], "m.png"),
+        ("new", ["--source", "0", "--mask", "black.png"], "black.png: the mask is empty"),
     ],
 )
 def test_where_no_photos_can_be_taken_is_told_at_the_start(
@@ -171,6 +173,7 @@ def test_where_no_photos_can_be_taken_is_told_at_the_start(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("mine")
+    Image.new("L", (8, 8)).save("black.png")
     with pytest.raises(SystemExit) as ended:
         main(["studio", "--port=0", str(folder), *words])
     assert ended.value.code == 1 and not opened

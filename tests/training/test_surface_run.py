@@ -21,6 +21,7 @@ from helpers.tiny import SIZE, tiny_processor, write_group, write_raw_tree
 
 from gift_peft import get_gift_model
 from gift_peft.dataset.gift_i import load_gift_i
+from gift_peft.dataset.light import epoch_light, in_light
 from gift_peft.dataset.loader import PreparedGroups, PreparedImages, epoch_flips, epoch_order
 from gift_peft.dataset.proxies import SurfaceSettings
 from gift_peft.models.loading import load_base
@@ -31,7 +32,8 @@ from gift_peft.training.surface_step import SurfaceStep
 pytestmark = pytest.mark.filterwarnings("ignore:.is_gradient_checkpointing. is deprecated:FutureWarning")
 
 FILLS = 1
-SURFACE = {"target": "surface", "fills": FILLS, "per_device_train_batch_size": 2, "flip": True}
+JITTER = 0.2
+SURFACE = {"target": "surface", "fills": FILLS, "per_device_train_batch_size": 2, "flip": True, "color_jitter": JITTER}
 
 
 @pytest.fixture(scope="module")
@@ -63,15 +65,16 @@ def args(base_dir, tree, tmp_path):
 
 
 def by_hand(model, groups, order, lambdas=(1.5, 1.0)):
-    """The mean loss of the images `order` lists as (index, flipped), from whole groups: straight from the formula."""
+    """The mean loss of the images `order` lists as (index, flipped, light): straight from the formula."""
     places = [(row, image) for row in range(len(groups)) for image in range(len(groups[row].names))]
     total, terms = 0, torch.zeros(2)
-    for index, flip in order:
+    for index, flip, light in order:
         row, image = places[index]
         group = groups[row]
         turn = [-1] if flip else []
         target = (group.surface_target_flipped if flip else group.surface_target)[image]
-        prediction = model(pixel_values=group.pixel_values[image : image + 1].flip(turn)).predicted_depth[0]
+        pixels = in_light(group.pixel_values[image : image + 1], light[None], tiny_processor())
+        prediction = model(pixel_values=pixels.flip(turn)).predicted_depth[0]
         mask = group.mask[image].flip(turn)
         difference = (prediction - target).abs()
         inside = difference[mask].mean() if mask.any() else 0 * difference.sum()
@@ -89,7 +92,7 @@ def test_a_run_is_adam_on_the_formula(base_dir, whole, groups):
     parameters = [p for p in model.parameters() if p.requires_grad]
     optimizer = torch.optim.Adam(parameters, lr=2e-4)
     order, flips = epoch_order(7, 0, 0), epoch_flips(7, 0, 0)
-    items = list(zip(order, flips, strict=True))
+    items = list(zip(order, flips, epoch_light(7, JITTER, 0, 0), strict=True))
     means = torch.zeros(3, dtype=torch.float64)
     for start in (0, 2, 4, 6):
         batch = items[start : start + 2]
@@ -118,7 +121,11 @@ def test_the_first_row_is_the_base(whole, groups):
 
 
 def test_the_target_is_learned(base_dir, tree, tmp_path):
-    train(arguments(base_dir, tree, tmp_path / "out", **SURFACE | {"flip": False}, num_train_epochs=12))
+    train(
+        arguments(
+            base_dir, tree, tmp_path / "out", **SURFACE | {"flip": False, "color_jitter": 0.0}, num_train_epochs=12
+        )
+    )
     rows = rows_of(tmp_path / "out")
     assert rows[-1]["consistency"] < 0.8 * rows[0]["consistency"]
 
@@ -179,7 +186,7 @@ def test_the_micro_batch_and_the_threads_do_not_matter(args, whole, base_dir, tr
     assert_close_run(tmp_path / "out", whole)
     checkpoint = sorted((tmp_path / "out").glob("checkpoint-*"))[0]
     assert checkpoint.name == "checkpoint-4"
-    for change in ({"per_device_train_batch_size": 4}, {"fills": 2}, {"flip": False}):
+    for change in ({"per_device_train_batch_size": 4}, {"fills": 2}, {"flip": False}, {"color_jitter": 0.0}):
         with pytest.raises(ValueError, match=r"changed since the checkpoint|stale surface target"):
             train_again(GiftTrainingArguments(**{**vars(args), **more}), **change)
 

@@ -22,6 +22,7 @@ from observed import SIZE, Observed, read_set
 from tqdm import tqdm
 
 from gift_peft import GroupStep, evaluate_gift_i, get_gift_model
+from gift_peft.dataset.light import in_light
 from gift_peft.dataset.loader import epoch_flips, epoch_order
 from gift_peft.evaluation.alignment import align
 from gift_peft.models.loading import DepthModel, load_base
@@ -29,7 +30,6 @@ from gift_peft.surface_targets import surface_target
 from gift_peft.training.speed import channels_last_head
 from gift_peft.training.surface_step import PredictedDepth, SurfaceStep
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the embedded base's processor
 BASE = Path(__file__).resolve().parents[3] / "src" / "gift_peft" / "demo" / "base"
 
 
@@ -91,7 +91,7 @@ def train(trial: plan.Trial, groups: list[Observed], seed: int, store: Path):
     if trial.rule is None:
         update, feed, epoch = _consensus(network, trial, groups, inputs, seed)
     else:
-        update, feed, epoch = _surface(network, trial, groups, inputs, seed, store)
+        update, feed, epoch = _surface(network, processor, trial, groups, inputs, seed, store)
     total = trial.updates or trial.epochs * epoch
     with channels_last_head(network):
         for number, item in zip(tqdm(range(total), trial.name, mininterval=20), feed, strict=False):
@@ -128,7 +128,7 @@ def _consensus(network, trial, groups, inputs, seed):
     return update, feed(), len(groups)
 
 
-def _surface(network, trial, groups, inputs, seed, store):
+def _surface(network, processor, trial, groups, inputs, seed, store):
     step = SurfaceStep(PredictedDepth(network), trial.lambda_c, trial.lambda_d, 4)
     places = [(row, image) for row, group in enumerate(groups) for image in range(len(group.images))]
     both = [False, True] if trial.flips else [False]
@@ -148,21 +148,13 @@ def _surface(network, trial, groups, inputs, seed, store):
             pixels.append(one.flip(-1) if flip else one)
             masks.append(mask.flip(-1) if flip else mask)
             wanted.append(maps[flip][row][image])
-        changed = jittered(torch.stack(pixels), trial.jitter, generator)
-        step.accumulate(changed, torch.stack(masks), torch.stack(wanted))
+        photos = torch.stack(pixels)
+        if trial.jitter:
+            drawn = 1 + trial.jitter * (2 * torch.rand(len(photos), 5, generator=generator) - 1)
+            photos = in_light(photos, drawn.numpy(), processor)
+        step.accumulate(photos, torch.stack(masks), torch.stack(wanted))
 
     return update, feed(), -(-len(places) // trial.batch)
-
-
-def jittered(pixels: torch.Tensor, amount: float, generator: torch.Generator) -> torch.Tensor:
-    """Normalized photos (n,3,h,w) in other light."""
-    if not amount:
-        return pixels
-    mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
-    drawn = 1 + amount * (2 * torch.rand(len(pixels), 5, 1, 1, generator=generator) - 1)
-    colors = (pixels * std + mean) * drawn[:, :1] * (1 + (drawn[:, 2:] - 1) / 3)
-    middle = colors.mean((1, 2, 3), keepdim=True)
-    return ((middle + (colors - middle) * drawn[:, 1:2]).clamp(0, 1) - mean) / std
 
 
 def choose(groups: list[Observed], photos: str) -> list[Observed]:

@@ -119,12 +119,18 @@ def check_frame(pixels: np.ndarray, source: str | Path) -> None:
         raise ValueError(f"{source}: frames of {pixels.shape[1]}x{pixels.shape[0]}; a side is at most {MAX_SIDE}")
 
 
-def open_quietly(source: str) -> "cv2.VideoCapture":
-    """What FFmpeg opens, a file or an address; it writes nothing to stderr."""
+def open_quietly(source: int | str) -> "cv2.VideoCapture":
+    """What FFmpeg opens, a file or an address, or a camera's number; it writes nothing to stderr."""
     import cv2
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else it writes a line for each damaged byte
-    return cv2.VideoCapture(source, cv2.CAP_FFMPEG)
+    log = cv2.utils.logging
+    level = log.getLogLevel()
+    log.setLogLevel(log.LOG_LEVEL_SILENT)  # else OpenCV writes a line of its own for each driver that it tries
+    try:
+        return cv2.VideoCapture(source) if isinstance(source, int) else cv2.VideoCapture(source, cv2.CAP_FFMPEG)
+    finally:
+        log.setLogLevel(level)
 
 
 def write_frame(path: Path, pixels: np.ndarray) -> None:

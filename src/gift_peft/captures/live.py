@@ -43,15 +43,7 @@ def live_frames(device: int | str) -> Generator[ClipFrame, None, None]:
 
 
 def _open(device: int | str, called: str) -> "cv2.VideoCapture":
-    import cv2
-
-    log = cv2.utils.logging
-    level = log.getLogLevel()
-    log.setLogLevel(log.LOG_LEVEL_SILENT)  # else OpenCV writes a line of its own for each driver that it tries
-    try:
-        capture = cv2.VideoCapture(device) if isinstance(device, int) else open_quietly(device)
-    finally:
-        log.setLogLevel(level)
+    capture = open_quietly(device)
     if not capture.isOpened():
         hint = "plug it in, close other programs that use it, or name another number"
         if isinstance(device, str):

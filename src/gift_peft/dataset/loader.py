@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from gift_peft.dataset.cache import GroupCache
+from gift_peft.dataset.light import in_light
 from gift_peft.dataset.tensors import Group
 from gift_peft.rules import UNKNOWN
 
@@ -54,6 +55,7 @@ class PreparedGroups:
     ) -> None:
         self.dataset = dataset
         self.image_names: list[list[str]] = dataset["image_names"][:]
+        self.processor = processor
         self.num_threads = num_threads
         self.pin = pin
         self.cache = GroupCache(dataset, processor, size, cache_dir)
@@ -99,9 +101,10 @@ class PreparedImages:
     def __len__(self) -> int:
         return len(self._places)
 
-    def read(self, index: int, flip: bool = False) -> Group:
+    def read(self, index: int, flip: bool = False, light: np.ndarray | None = None) -> Group:
         """One image, called `<group>/<image>`, or its mirror image; `surface_target` is that of what is shown.
 
+        `light`: (5,), the factors of `in_light` by which it is shown in another light.
         Errors of `GroupCache.read`; ValueError if the row has no surface targets.
         """
         image = self.groups.cache.read(*self._places[index])
@@ -112,14 +115,16 @@ class PreparedImages:
             image.pixel_values, image.mask = image.pixel_values.flip(-1), image.mask.flip(-1)
             image.valid = None if image.valid is None else image.valid.flip(-1)
             image.surface_target = image.surface_target_flipped
+        if light is not None:
+            image.pixel_values = in_light(image.pixel_values, light[None], self.groups.processor)
         image.surface_target_flipped = None
         if (unknown := image.surface_target == UNKNOWN).any():  # as with the proxies of whole groups
             image.valid = ~unknown if image.valid is None else image.valid & ~unknown
             image.surface_target = image.surface_target.masked_fill(unknown, 0)
         return self.groups.pinned(image)
 
-    def take(self, items: Iterable[tuple[int, bool]]) -> Iterator[Group]:
-        """`read` of these (index, flip), in this order; there may be infinitely many."""
+    def take(self, items: Iterable[tuple[int, bool, np.ndarray | None]]) -> Iterator[Group]:
+        """`read` of these (index, flip, light), in this order; there may be infinitely many."""
         return read_ahead(lambda item: self.read(*item), items, self.num_threads)
 
 

@@ -1,8 +1,10 @@
 """A capture on its way: frames come in, the coach judges them, photos go into groups of a raw tree."""
 
 import errno
+import itertools
 import os
 import re
+import unicodedata
 from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,7 +16,7 @@ from gift_peft.captures.clip import CLIP_SUFFIXES, Clip, ClipFrame, find_clips, 
 from gift_peft.captures.folders import files_below, holds_no_photos
 from gift_peft.captures.live import live_frames
 from gift_peft.captures.tree import find_groups
-from gift_peft.files import is_leftover
+from gift_peft.files import is_leftover, printable
 from gift_peft.images import is_image_file, open_image, to_mask
 from gift_peft.prepare.coach import BLINK, Advice, Coach
 from gift_peft.rules import SPLITS, check_group_id
@@ -72,6 +74,14 @@ def check_tree(out: Path) -> None:
         raise ValueError(f"OUT {out} holds something else than groups of photos: name another folder")
 
 
+def read_target(mask: str | None) -> np.ndarray | None:
+    """The target that a file shows, (H, W) bool. Raises ValueError or an OSError naming the file."""
+    target = None if mask is None else to_mask(open_image(mask), mask)
+    if target is not None and not target.any():
+        raise ValueError(f"{mask}: the mask is empty; draw the target in white")
+    return target
+
+
 def _files_of_groups(out: Path) -> dict[Path, list[Path]]:
     """What lies in each group's folder of a raw tree; nothing where there are none."""
     try:
@@ -123,10 +133,7 @@ class Session:
     ) -> None:
         check_tree(out)
         self.out, self.reference_at, self.asks = out, reference_at, asks
-        self.mask_file = mask
-        self.mask = None if mask is None else to_mask(open_image(mask), mask)
-        if self.mask is not None and not self.mask.any():
-            raise ValueError(f"{mask}: the mask is empty; draw the target in white")
+        self.mask_file, self.mask = mask, read_target(mask)
         self.name = free_name(out) if group is None else self._checked_name(group)
         self.folder = out / self.name
         self.coach = Coach(self.mask, most)
@@ -288,17 +295,23 @@ class Session:
             lines.append(told)
         if self.coach.wanted == "reference":
             lines.append("The treated reference was asked for and not taken.")
-        if self.mask is None:
-            place = next(iter(self.photos)) / "mask.png"
-            lines.append(f"Draw the target in {place}, white where the glass or mirror is.")
-        if empty := [folder.name for folder, files in _files_of_groups(self.out).items() if not files]:
+        if undrawn := self.undrawn:
+            lines.append(f"Draw the target in {undrawn[0] / 'mask.png'}, white where the glass or mirror is.")
+        if empty := [printable(folder.name) for folder, files in _files_of_groups(self.out).items() if not files]:
             lines.append(f"Without photos yet, which `prepare` will say, too: {', '.join(empty)}.")
         raw = self.out
         if Path(os.path.abspath(raw)).name in SPLITS:  # a split of the raw tree above
             raw = raw.parent if raw.name not in ("", "..") else raw / ".."
         return [*lines, f"Next: {prepare_line(raw)}"]
 
+    @property
+    def undrawn(self) -> list[Path]:
+        """Folders of groups that have no mask yet."""
+        return [folder for folder in self.photos if not any(folder.glob("mask*"))]
+
     def _checked_name(self, group: str) -> str:
+        if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in group):
+            raise ValueError(f"group {group!r}: there is something in it that is no text; name another")
         check_group_id(group)
         if group.casefold() in (*SPLITS, "val", "valid") or holds_no_photos(group):
             raise ValueError(f"group {group}: a folder of this name is no group in a raw tree; name another")
@@ -355,12 +368,11 @@ class Session:
         if not taken and self.folder not in self._began and not self._is_free(self.folder):
             self.folder = self._next_folder()
         self._began.add(self.folder)
-        number = int(taken[-1].stem) + 1 if taken else 1
-        path = self.folder / ("reference.png" if advice.is_reference else f"{number:03d}.png")
+        path = self.folder / ("reference.png" if advice.is_reference else f"{self._free_number():03d}.png")
         if path.exists():
             raise FileExistsError(errno.EEXIST, "another program has put a file there meanwhile", str(path))
         try:
-            if not taken and self.mask is not None:
+            if not taken and self.mask is not None and not any(self.folder.glob("mask.*")):
                 mask = self.folder / "mask.png"
                 write_frame(mask, self.coach.mask_here.astype(np.uint8) * 255)
                 self._masks[self.folder] = mask.stat().st_mtime_ns
@@ -370,6 +382,12 @@ class Session:
                 self._remove_empty(self.folder)
             raise
         return path
+
+    def _free_number(self) -> int:
+        """Of the next photo: no file has it, not even the mask of a photo that was dropped, which would become its."""
+        taken = self.photos.get(self.folder)
+        first = int(taken[-1].stem) + 1 if taken else 1
+        return next(number for number in itertools.count(first) if not any(self.folder.rglob(f"{number:03d}*")))
 
     def _remove_empty(self, folder: Path) -> None:
         """A group without photos goes, unless something of somebody else's is in it."""

@@ -15,9 +15,10 @@ from PIL import Image
 from gift_peft.captures.measured_depth import read_measured_depth
 from gift_peft.captures.tree import Capture, Decoded, check_masks, decode_capture
 from gift_peft.dataset.writer import write_group
+from gift_peft.files import printable
 from gift_peft.prepare.entries import FrameEntry, GroupEntry, GroupQuality, ReferenceQuality, Remark
 from gift_peft.prepare.frame_bar import note_frame
-from gift_peft.prepare.job import Job, Outcome, capture_digest, group_choices, printable, proposal_choices
+from gift_peft.prepare.job import Job, Outcome, capture_digest, group_choices, proposal_choices
 from gift_peft.prepare.photo import Photo, Rejection
 from gift_peft.prepare.quality import SmallFrame, check_frames, check_group_change, pairwise_changes
 from gift_peft.prepare.registration import register, warp

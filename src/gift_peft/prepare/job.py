@@ -10,6 +10,7 @@ from gift_peft.captures.foreign import Layout
 from gift_peft.captures.group_facts import GROUP_FILES
 from gift_peft.captures.known_datasets import KnownLayout
 from gift_peft.captures.tree import Capture, read_capture
+from gift_peft.files import printable
 from gift_peft.prepare.entries import Remark
 from gift_peft.prepare.settings import PrepareSettings
 
@@ -118,8 +119,3 @@ def capture_digest(capture: Capture, choices: dict) -> str:
                 content = hashlib.file_digest(file, "blake2b").hexdigest()
             digest.update(f"\n{os.path.relpath(path, capture.folder)} {content}".encode(errors="surrogateescape"))
     return digest.hexdigest()
-
-
-def printable(text: str) -> str:
-    """File names may hold bytes that are no text; a report may not."""
-    return text.encode("utf-8", "backslashreplace").decode()

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gift_peft.captures.tree import Capture, check_masks
-from gift_peft.files import existing_folder
+from gift_peft.files import existing_folder, printable
 from gift_peft.prepare.clip_groups import is_clip_job
 from gift_peft.prepare.group import prepare_group
-from gift_peft.prepare.job import Job, capture_digest, group_choices, printable
+from gift_peft.prepare.job import Job, capture_digest, group_choices
 from gift_peft.prepare.prepare import list_jobs
 from gift_peft.prepare.settings import PrepareSettings
 from gift_peft.rules import SPLITS, check_count, check_group_id, check_pair

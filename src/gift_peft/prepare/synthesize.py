@@ -22,9 +22,9 @@ from tqdm import tqdm
 
 from gift_peft.captures.masks import MaskSource, is_mask_file
 from gift_peft.captures.tree import Capture, check_masks, find_groups, read_capture
-from gift_peft.files import read_yaml, remove_folder, strangers, whole_folder, write_whole
+from gift_peft.files import printable, read_yaml, remove_folder, strangers, whole_folder, write_whole
 from gift_peft.images import image_digest, is_image_file, read_image
-from gift_peft.prepare.job import capture_digest, printable
+from gift_peft.prepare.job import capture_digest
 from gift_peft.prepare.out_folder import alone, check_card, check_places, note_card, side_by_side
 from gift_peft.rules import SPLITS, check_group_id
 from gift_peft.surface_targets import paint_fills

@@ -123,6 +123,7 @@ class CaptureRoom:
                 raise ValueError("this tab takes no photos now")
             if what == "end":
                 self._stop.set()
+                self._shown = self._shown | {"next": "The camera is being closed.", "well": True}
             else:
                 self._typed.append(TYPED[what])
         return {}
@@ -146,7 +147,9 @@ class CaptureRoom:
         with self._taking:
             photos = self._photos()
             for path in photos.values():
-                if path not in self._thumbnails and (pixels := cv2.imread(str(path))) is not None:
+                if path in self._thumbnails or not path.is_file():
+                    continue
+                if (pixels := cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)) is not None:
                     self._thumbnails[path] = jpeg_uri(_small(pixels, THUMBNAIL), quality=80)
             shown = [{"name": name, "picture": self._thumbnails.get(path)} for name, path in photos.items()]
         return {"photos": shown}
@@ -163,7 +166,7 @@ class CaptureRoom:
 
     def _begin(self, tab: str) -> None:
         self._tab, self._asked, self._wrong, self._pixels = tab, time.monotonic(), None, None
-        self._shown = {"group": self.session.name, "photos": self._count(), "next": "The camera is being opened."}
+        self._shown = self._show(self.session) | {"next": "The camera is being opened.", "well": True}
         self._typed.clear()
         self._stop = threading.Event()
         work = {"args": (self.session, self._stop), "daemon": True, "name": "capture"}
@@ -177,8 +180,9 @@ class CaptureRoom:
         try:
             for frame in frames:
                 if clip:  # as fast as it was taken, so that somebody can follow
-                    stop.wait(start + frame.seconds - time.monotonic())
-                if stop.is_set() or time.monotonic() - self._asked > GONE:
+                    while (ahead := start + frame.seconds - time.monotonic()) > 0 and not self._left(stop):
+                        stop.wait(min(ahead, PATIENCE))
+                if self._left(stop):
                     last = "stopped" if stop.is_set() else "the page was closed, and the camera is off"
                     break
                 with self._taking:
@@ -203,6 +207,10 @@ class CaptureRoom:
                     self._said.append(f"{session.seconds:7.1f} s  {last}")
                 self._thread = None
                 self._news.notify_all()
+
+    def _left(self, stop: threading.Event) -> bool:
+        """Whether somebody has ended it, or its tab was closed."""
+        return stop.is_set() or time.monotonic() - self._asked > GONE
 
     def _show(self, session: Session) -> dict:
         return {
@@ -242,7 +250,7 @@ class CaptureRoom:
         if self.session is None:
             return answer
         with self._taking:
-            key = self._version, self.session.frames, self._wrong
+            key = self._version, self.session.frames, self._wrong, self.session.undrawn
             if self._ended is None or self._ended[0] != key:  # looking through a large RAW takes its time
                 told, wrong = self._finished()
                 self._ended = key, {"told": told, "groups": self._groups(), "wrong": wrong}
@@ -252,7 +260,7 @@ class CaptureRoom:
         """What is said at the end, or what is wrong."""
         try:
             return self.session.finish(self.source.name), self._wrong
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             return [], self._wrong or str(error)
 
     def _groups(self) -> list[str]:

@@ -22,6 +22,7 @@ from gift_peft.captures.clip_group import find_clip_group
 from gift_peft.captures.links import checked
 from gift_peft.captures.tree import find_groups, read_capture
 from gift_peft.colormap import colorize_error
+from gift_peft.files import printable
 from gift_peft.images import jpeg_uri
 from gift_peft.studio.group_view import GroupView, look_at
 from gift_peft.studio.mask_edits import check_edits, draw_edits
@@ -163,7 +164,7 @@ class MaskRoom:
     def _folder(self, request: dict) -> tuple[str, str, Path]:
         """The group's name, split and folder; ValueError if there is no such group, or it is a link out of RAW."""
         name = request.get("group")
-        folders = {f"{split}/{folder}": (split, path) for (split, folder), path in self._folders().items()}
+        folders = {printable(f"{split}/{folder}"): (split, path) for (split, folder), path in self._folders().items()}
         if not isinstance(name, str) or name not in folders:
             raise ValueError(f"there is no group {str(name)[:80]!r}")
         split, path = folders[name]

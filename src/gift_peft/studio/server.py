@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
+from gift_peft.files import printable
+
 if TYPE_CHECKING:  # each brings its own heavy packages
     from gift_peft.studio.capture_room import CaptureRoom
     from gift_peft.studio.compare_room import CompareRoom
@@ -205,11 +207,20 @@ def _answer(method: Callable[[dict], dict]) -> Callable[[Any], dict]:
         try:
             if not isinstance(request, dict):
                 raise ValueError("a request is an object")
-            return method(request)
+            return _sendable(method(request))
         except (ValueError, OSError) as error:
-            return {"error": " ".join(str(error).split())}
+            return {"error": printable(" ".join(str(error).split()))}
 
     return answer
+
+
+def _sendable(value: Any) -> Any:
+    """An answer with all its texts `printable`: with others, nothing would arrive."""
+    if isinstance(value, dict):
+        return {_sendable(key): _sendable(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_sendable(item) for item in value]
+    return printable(value) if isinstance(value, str) else value
 
 
 def _capture_tab(gr: Any, room: "CaptureRoom", _: Any) -> None:

@@ -143,12 +143,10 @@ def _rooms(args: Namespace, kind: str, temporary: Path) -> "Rooms":
 
 
 def _capture(args: Namespace):
-    from gift_peft.images import open_image, to_mask
-    from gift_peft.prepare.capture_session import open_source
+    from gift_peft.prepare.capture_session import open_source, read_target
     from gift_peft.studio.capture_room import CaptureRoom
 
-    if args.mask is not None:
-        to_mask(open_image(args.mask), args.mask)
+    read_target(args.mask)  # what is wrong with it is told now, and not when somebody presses Start
     return CaptureRoom(Path(args.folder), open_source(args.source), args.mask)
 
 

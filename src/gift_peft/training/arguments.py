@@ -58,6 +58,7 @@ OWN = {
         "per_device_train_batch_size",
         "gradient_accumulation_steps",
         "flip",
+        "color_jitter",
         "fills",
         "surface_model",
         "surface_quantile",
@@ -107,7 +108,7 @@ RANGES = (
         "must be finite and not negative",
     ),
     (("learning_rate", "adam_epsilon"), lambda value: 0 < value < math.inf, "must be positive and finite"),
-    (("adam_beta1", "adam_beta2"), lambda value: 0 <= value < 1, "must be at least 0 and below 1"),
+    (("adam_beta1", "adam_beta2", "color_jitter"), lambda value: 0 <= value < 1, "must be at least 0 and below 1"),
     (("seed",), lambda value: value < 2**32, "must be below 2**32"),
     (("max_steps",), lambda value: value >= 1 or value == -1, "must be at least 1, or -1"),
     (("micro_batch_size",), lambda value: value == "auto" or value >= 1, "must be at least 1, or auto"),
@@ -165,6 +166,9 @@ class GiftTrainingArguments:
     )
     gradient_accumulation_steps: int = _arg("surface: such batches per update and process", 1)
     flip: bool = _arg("surface: show every second image as in a mirror, with its own target", False)
+    color_jitter: float = _arg(
+        "surface: largest share by which brightness and contrast of a photo change, drawn anew", 0.0
+    )
     fills: int = _arg("surface: copies of each photo with its target painted, which the targets are made from", 6)
     surface_model: Literal["auto", "plane", "quantile"] = _arg("surface: what a surface is taken for", "auto")
     surface_quantile: float | None = _arg(
@@ -178,8 +182,7 @@ class GiftTrainingArguments:
     )
     compile: bool = _arg("torch.compile the encoder's blocks; changes the bits", False)
     channels_last: bool | None = _arg(
-        "the head's convolutions in channels-last layout; changes the bits; default: if it trains in full",
-        None,
+        "the head's convolutions in channels-last layout; changes the bits; default: if it trains in full", None
     )
     num_train_epochs: int = _arg("passes over the groups (one update per group) or, for surface, their images", 50)
     max_steps: int = _arg("stop after this many updates; -1: num_train_epochs decides", -1)

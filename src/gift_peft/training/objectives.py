@@ -12,10 +12,12 @@ from functools import partial
 from itertools import repeat
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from accelerate import Accelerator
 from tqdm import tqdm
 
+from gift_peft.dataset.light import epoch_light
 from gift_peft.dataset.loader import PreparedGroups, PreparedImages, epoch_flips, epoch_order, read_ahead
 from gift_peft.dataset.shares import failing_together, in_order, own_share
 from gift_peft.dataset.tensors import Group
@@ -134,6 +136,9 @@ class Consensus:
         return "\n".join(notes)
 
 
+Shown = tuple[int, bool, np.ndarray | None]  # an image, whether it is flipped, and its light
+
+
 class Share(NamedTuple):
     """Of an update: this process's images, and how many images it has in all; `idle` if they only stand in."""
 
@@ -180,17 +185,19 @@ class Surface:
         self.step.micro_batch_size = min(int(chosen), self.args.per_device_train_batch_size)
         return settled
 
-    def epoch_updates(self, epoch: int) -> list[list[tuple[int, bool]]]:
-        """(image, whether it is flipped) of each update of an epoch, over all processes; the last may have fewer."""
+    def epoch_updates(self, epoch: int) -> list[list[Shown]]:
+        """What each update of an epoch shows, over all processes; the last may have fewer."""
         order = epoch_order(len(self.images), self.args.seed, epoch)
-        flips = epoch_flips(len(order), self.args.seed, epoch) if self.args.flip else repeat(False)
-        items = list(zip(order, flips, strict=False))
+        count, seed, jitter = len(order), self.args.seed, self.args.color_jitter
+        flips = epoch_flips(count, seed, epoch) if self.args.flip else repeat(False)
+        lights = epoch_light(count, jitter, seed, epoch) if jitter else repeat(None)
+        items = list(zip(order, flips, lights, strict=False))
         return [items[start : start + self.batch] for start in range(0, len(items), self.batch)]
 
     def feed(self, step: int) -> Iterator[Share]:
         """This process's share of all updates after `step`, without end."""
 
-        def shares() -> Iterator[tuple[list[tuple[int, bool]], int, bool]]:
+        def shares() -> Iterator[tuple[list[Shown], int, bool]]:
             for items in updates_after(step, self.epoch_steps, self.epoch_updates):
                 mine = items[self.accelerator.process_index :: self.accelerator.num_processes]
                 yield mine or items[:1], len(items), not mine

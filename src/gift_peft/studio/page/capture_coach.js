@@ -2,16 +2,14 @@
 // there is a new picture), and shows it; the server takes the photos.
 const $ = (selector) => element.querySelector(selector);
 const pressing = [...element.querySelectorAll("[data-press]")];
-const room = { state: "", seen: -1, version: -1, photos: 0, warned: "", said: "", groups: [], ended: () => {} };
+const room = { state: "", seen: -1, version: -1, photos: 0, warned: "", wrong: null, said: "", groups: [], begins: false, ended: () => {} };
+const LOST = "The studio does not answer: start it again. What was taken is kept.";
 room.tab = sessionStorage.getItem("studio tab") || crypto.randomUUID();
 sessionStorage.setItem("studio tab", room.tab);  // a reload is the same tab
 
 async function ask(name, more = {}) {
-  try {
-    return await server[name]({ tab: room.tab, ...more });
-  } catch (error) {
-    return { error: "The studio does not answer: start it again. What was taken is kept.", lost: true };
-  }
+  const answer = await server[name]({ tab: room.tab, ...more });
+  return answer || { error: LOST, lost: true };  // gradio catches what fails, and gives nothing
 }
 
 function complain(text) {
@@ -38,15 +36,16 @@ function beep(tones) {  // whoever stands at the mirror does not see the screen
 // ---- what there is to see ----
 
 function show(answer) {
-  const runs = answer.state === "running";
-  const between = !runs && answer.state !== "elsewhere";
+  const runs = answer.state === "running", between = answer.state === "idle" || answer.state === "stopped";
   if (room.state !== answer.state) {
+    const here = element.contains(document.activeElement);
     $(".begins").hidden = !between;
-    $(".tools").hidden = answer.state === "elsewhere";
+    $(".tools").hidden = !runs && !between;
     $(".live").hidden = !runs;
-    $(".figures").hidden = answer.state === "idle" || answer.state === "elsewhere";
+    $(".figures").hidden = !runs && answer.state !== "stopped";
     for (const button of pressing) button.disabled = !runs;
     if (runs) $(".live").focus();
+    else if (room.state === "running" && here) $(".next").focus();  // what had it is no longer there
   }
   room.state = answer.state;
   if (answer.picture) { $(".picture").src = answer.picture; room.seen = answer.number; }
@@ -69,10 +68,15 @@ function show(answer) {
     room.said = said;
     $(".log").replaceChildren(...(answer.said || []).map((line) => Object.assign(document.createElement("li"), { textContent: line })));
   }
-  if (answer.wrong) complain(answer.wrong);
+  if ((answer.wrong || null) !== room.wrong) complain(room.wrong = answer.wrong || null);
   if (between) offer(answer);
   else $("[data-do=mask]").hidden = !(runs && answer.photos);
-  if (answer.version !== room.version && answer.state !== "elsewhere") { room.version = answer.version; strip(); }
+  if (runs || between) {
+    if (answer.version !== room.version) { room.version = answer.version; strip(); }
+  } else {
+    room.seen = room.version = -1;  // another tab or another studio may show others
+    if (answer.state === "elsewhere") $(".strip").replaceChildren();
+  }
 }
 
 function offer(answer) {  // what may be begun now
@@ -110,7 +114,8 @@ async function strip() {
 async function watch() {
   while (element.isConnected) {
     const answer = await ask("look", { seen: room.seen });
-    if (answer.error) complain(answer.error);
+    if (answer.lost) show({ state: "lost", next: LOST, photos: room.photos });
+    else if (answer.error) complain(answer.error);
     else show(answer);
     if (room.state !== "running" || answer.error) { room.ended(); await wait(answer.lost ? 3000 : 1000); }
   }
@@ -118,25 +123,30 @@ async function watch() {
 
 // ---- what a person does ----
 
+async function begin(name, more) {
+  hearing = hearing || new AudioContext();
+  if (room.begins) return;
+  room.begins = true;
+  const { error } = await ask(name, more);
+  room.begins = false;
+  complain(error);
+  if (error) return;
+  $(".group").value = "";
+  $(".begins").hidden = true;  // from the second of two clicks
+  room.state = "";
+}
+
 const actions = {
-  start: async () => {
-    hearing = hearing || new AudioContext();
-    const answer = await ask("start", { group: $(".group").value, split: $(".split").value });
-    complain(answer.error);
-    if (!answer.error) $(".group").value = "";
-  },
-  resume: async () => {
-    hearing = hearing || new AudioContext();
-    complain((await ask("resume")).error);
-  },
+  start: () => begin("start", { group: $(".group").value, split: $(".split").value }),
+  resume: () => begin("resume"),
   mask: async () => {
     if (room.state === "running") {
+      room.groups = [];
       await press("end");
       await new Promise((resolve) => { room.ended = resolve; });
     }
     if (!room.groups.length) return;
-    window.studioGroup = room.groups.at(-1);  // the Masks room may not be there yet
-    window.dispatchEvent(new Event("studio group"));
+    window.studioGroup = room.groups.at(-1);  // which the Masks room opens as soon as it is seen
     [...document.querySelectorAll("[role=tab], .overflow-dropdown button")].find((one) => one.textContent.trim() === "Masks").click();
   },
 };
@@ -151,6 +161,10 @@ for (const button of element.querySelectorAll("[data-do]")) button.addEventListe
 $(".group").addEventListener("keydown", (event) => event.key === "Enter" && actions.start());
 const keys = { p: "photo", r: "reference", q: "end" };
 element.addEventListener("keydown", (event) => {
+  if (event.repeat) {  // a key that is held asks for one photo, and so does a button that it presses
+    if (event.target.matches("button")) event.preventDefault();
+    return;
+  }
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("[type=text], select")) return;
   const what = keys[event.key.toLowerCase()];
   if (what) { event.preventDefault(); press(what); }

@@ -11,12 +11,8 @@ function say(text, wrong = false) {
 }
 
 async function ask(name, more = {}) {
-  let answer;
-  try {
-    answer = await server[name]({ group: room.group, ...more });
-  } catch (error) {
-    answer = { error: "The studio does not answer: start it again. What was saved is kept." };
-  }
+  const lost = "The studio does not answer: start it again. What was saved is kept.";
+  const answer = (await server[name]({ group: room.group, ...more })) || { error: lost };  // gradio catches what fails
   if (answer.error && !answer.conflict) say(answer.error, true);
   return answer;
 }
@@ -45,7 +41,8 @@ function take(state) {  // a saved mask to begin with, and what this tab had dra
 // ---- groups and photos ----
 
 async function list() {
-  const { groups = [] } = await ask("groups");
+  const { groups } = await ask("groups");
+  if (!groups) return undefined;
   $(".group").replaceChildren(...groups.map((one) => new Option(`${one.done ? "✓" : "○"} ${one.name}: ${one.state}`, one.name)));
   const wanted = window.studioGroup || room.group;  // where the Capture room has taken photos
   window.studioGroup = undefined;
@@ -63,7 +60,7 @@ async function open(name, quiet = false) {
     say("Opening the group.");
   }
   const watch = setInterval(async () => {
-    const { said } = await server.progress({ group: name }).catch(() => ({}));
+    const { said } = (await server.progress({ group: name })) || {};
     if (said && !room.view) say(`${said[0].toUpperCase()}${said.slice(1)} ...`);
   }, 700);
   const view = await ask("open");
@@ -340,6 +337,8 @@ for (const button of element.querySelectorAll("[data-do]")) button.addEventListe
 $(".group").addEventListener("change", () => open($(".group").value));
 $(".for").addEventListener("change", () => choose($(".for").value));
 use("hit");
-const begin = () => list().then((name) => name && open(name));
-window.addEventListener("studio group", begin);
-begin();
+new IntersectionObserver(async ([seen]) => {  // whenever the room is shown: there may be new groups
+  if (!seen.isIntersecting) return;
+  const before = room.group, name = await list();
+  if (name && (name !== before || !room.view)) open(name);
+}).observe(element);

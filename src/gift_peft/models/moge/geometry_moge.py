@@ -73,7 +73,7 @@ def _search(z: Tensor, along: Tensor, square: Tensor, weight: Tensor) -> tuple[T
     grid = torch.linspace(math.log(NEAREST), math.log(FARTHEST), CANDIDATES, dtype=z.dtype, device=z.device).exp()
     shifts = scale.clamp(min=torch.finfo(torch.float32).tiny)[:, None] * grid - nearest[:, None]  # (B,C)
     inverse = _inverse(z[:, None] + shifts[..., None])
-    # N^2 / D less what it is for points all at one distance, from what moves them off it: far away that is all there is.
+    # N^2 / D less what it is for points all at one distance, from what moves them off it: far away little does.
     n, d = along.sum(1, keepdim=True), square.sum(1, keepdim=True)
     plane = n / torch.where(d > 0, d, 1.0)
     middle = (square[:, None] * inverse).sum(-1, keepdim=True) / torch.where(d > 0, d, 1.0)[..., None]
@@ -92,8 +92,8 @@ def _inverse(depth: Tensor) -> Tensor:
 def _stationarity(z: Tensor, along: Tensor, square: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """(B,) what is 0 where N^2 / D is extremal over the shift, its derivative, and N / D, the focal length.
 
-    The first is (N D' - 2 N' D) / 2 D, and all are sums of what is small at each point, because products of the sums are
-    nearly equal and in a runtime without float64 their differences would have no digits.
+    The first is (N D' - 2 N' D) / 2 D, and all are sums of what is small at each point, because products of the sums
+    are nearly equal and in a runtime without float64 their differences would have no digits.
     """
     r = _inverse(z + shift[:, None])
     n, d = (along * r).sum(1), (square * r**2).sum(1)

@@ -53,6 +53,20 @@ def test_it_is_the_packages_own_forward(name, tiny_vit):
         assert torch.equal(model(pixels).points, model(pixels, num_tokens=int(most)).points)
 
 
+def test_a_grid_of_tokens_stands_for_their_number(tiny_vit):
+    model, pixels = tiny_moge(), images(2, 3, 70, 98)
+    with torch.no_grad():
+        theirs, ours = model(pixels, num_tokens=24), model(pixels, token_grid=(4, 6))  # 24 / 1.4 and 24 * 1.4
+        other = model(pixels, token_grid=(6, 4))
+    assert torch.equal(ours.predicted_depth, theirs.predicted_depth)
+    assert torch.equal(ours.metric_scale, theirs.metric_scale)
+    assert not torch.allclose(other.predicted_depth, theirs.predicted_depth, rtol=1e-3)
+    with pytest.raises(ValueError, match="token_grid must be positive"):
+        model(pixels, token_grid=(0, 6))
+    with pytest.raises(ValueError, match="token_grid: the first version"):
+        tiny_moge(name="v1")(pixels, token_grid=(4, 6))
+
+
 @pytest.mark.parametrize("name", ["v1", "v2"])
 def test_depth_is_that_of_its_infer(name, tiny_vit, monkeypatch):
     import scipy.optimize

@@ -4,6 +4,8 @@ LoRA adds `scale * B A` to a weight and a part trained in full is base + scale *
 `set_adapter_scale`; both are worked out inside the graph, from the base's weights and what the adapter adds to them.
 """
 
+from typing import Any
+
 import torch
 from peft import PeftModel
 from peft.tuners.lora import LoraLayer
@@ -59,7 +61,7 @@ class DialedNetwork(nn.Module):
         self.deltas[key] = nn.Parameter(tensor.detach().clone(), requires_grad=False)
         return key
 
-    def forward(self, pixel_values: Tensor, adapter_scale: Tensor) -> Tensor:
+    def forward(self, pixel_values: Tensor, adapter_scale: Tensor, token_grid: Tensor | None = None) -> Tensor:
         weights = dict(self.network.named_parameters()) | dict(self.network.named_buffers())
         changed = {}
         for path, key in self.added.items():
@@ -67,8 +69,8 @@ class DialedNetwork(nn.Module):
         for path, (up, down, scaling, shape) in self.low_rank.items():
             product = (self.deltas[up] @ self.deltas[down]).reshape(shape)
             changed[path] = weights[path] + adapter_scale.reshape(()) * scaling * product
-        output = torch.func.functional_call(self.network, changed, kwargs={"pixel_values": pixel_values})
-        return output.predicted_depth
+        inputs = _inputs(pixel_values, token_grid)
+        return torch.func.functional_call(self.network, changed, kwargs=inputs).predicted_depth
 
 
 class PlainNetwork(nn.Module):
@@ -78,5 +80,11 @@ class PlainNetwork(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, pixel_values: Tensor) -> Tensor:
-        return self.network(pixel_values=pixel_values).predicted_depth
+    def forward(self, pixel_values: Tensor, token_grid: Tensor | None = None) -> Tensor:
+        return self.network(**_inputs(pixel_values, token_grid)).predicted_depth
+
+
+def _inputs(pixel_values: Tensor, token_grid: Tensor | None) -> dict[str, Any]:
+    """A network's arguments; of `token_grid` (rows, columns) the shape counts, see `token_grid.py`."""
+    inputs: dict[str, Any] = {"pixel_values": pixel_values}
+    return inputs if token_grid is None else inputs | {"token_grid": tuple(token_grid.shape)}

@@ -25,10 +25,12 @@ from gift_peft.deploy.dial import INPUT
 from gift_peft.deploy.resampling import resampled_by_matrices
 from gift_peft.deploy.runtime import MODEL_ID
 from gift_peft.deploy.stages import stages
+from gift_peft.deploy.token_grid import GRID, compute_grid, grid_in_graph, tokens_of
 from gift_peft.files import reason, whole_folder
 
 OPSET = 20  # the first with Gelu
 TRACED = 8, 10  # patches; neither square nor a size that anybody asks for
+TRACED_GRID = 6, 9  # of tokens, where a network takes others than the picture's patches
 INT8_ERROR = 0.005  # mean error on the reference pictures, relative to the mean of the output
 INT8_PARTS = 24  # of a network whose whole costs more than that
 
@@ -86,7 +88,8 @@ def write_onnx(bundle: Bundle, path: Path) -> None:
     """The network of a bundle as an ONNX file (weights above 2 GB in a file beside it)."""
     network = bundle.network
     program = exported_program(network, bundle.multiple, bundle.dial, bundle.name)
-    names = ["pixel_values", INPUT] if bundle.dial else ["pixel_values"]
+    tokens = tokens_of(network)
+    names = ["pixel_values", *([INPUT] if bundle.dial else []), *([] if tokens is None else [GRID])]
     try:
         with _quietly():
             graph = torch.onnx.export(
@@ -94,13 +97,15 @@ def write_onnx(bundle: Bundle, path: Path) -> None:
             )
     except Exception as error:  # its errors have no common class
         raise ValueError(f"{bundle.name} cannot be exported to ONNX: {failed_operation(error)}") from None
+    if tokens is not None:
+        compute_grid(graph.model, tokens)
     _name_sizes(graph.model)
     graph.model.metadata_props[MODEL_ID] = bundle.settings["model_id"]
     graph.save(path)
 
 
 def exported_program(network: nn.Module, multiple: int, dial: bool, name: str) -> torch.export.ExportedProgram:
-    """`torch.export` of a network of pixel values (and a scale), for any batch and sides in patches.
+    """`torch.export` of a network of pixel values (a scale, a grid of tokens), for any batch and sides in patches.
 
     Raises ValueError with the operation that cannot be exported.
     """
@@ -108,11 +113,15 @@ def exported_program(network: nn.Module, multiple: int, dial: bool, name: str) -
     inputs: tuple[torch.Tensor, ...] = (torch.rand(2, 3, height, width),)
     batch = torch.export.Dim("batch", min=1)
     rows, columns = (torch.export.Dim(side, min=2) for side in ("rows", "columns"))
-    sizes: dict[str, Any] = {"pixel_values": {0: batch, 2: multiple * rows, 3: multiple * columns}}
+    sides = (rows, columns) if multiple == 1 else (multiple * rows, multiple * columns)
+    sizes: dict[str, Any] = {"pixel_values": {0: batch, 2: sides[0], 3: sides[1]}}
     if dial:
         inputs, sizes = (*inputs, torch.ones(1)), sizes | {INPUT: None}
+    if tokens_of(network) is not None:
+        token_sides = {axis: torch.export.Dim(f"token_{side}", min=1) for axis, side in enumerate(("rows", "columns"))}
+        inputs, sizes = (*inputs, torch.zeros(TRACED_GRID)), sizes | {GRID: token_sides}
     try:
-        with torch.no_grad(), resampled_by_matrices(), _quietly():
+        with torch.no_grad(), resampled_by_matrices(), grid_in_graph(network), _quietly():
             return torch.export.export(network, inputs, dynamic_shapes=sizes, strict=True)
     except Exception as error:  # dynamo's errors have no common class
         raise ValueError(f"{name} cannot be exported for every size: {failed_operation(error)}") from None

@@ -56,29 +56,36 @@ def resample(
         # torch takes positions of nearest in float32 whatever the values are; at ties that says which pixel.
         like = input.new_zeros((), dtype=torch.float32) if mode == "nearest" else input
         step = _step(length, count, factor, bool(align_corners), like)
-        if mode == "nearest":
-            places = torch.arange(count, device=input.device).to(step.dtype) * step
-            input = input.index_select(dimension, places.floor().to(torch.int64).clamp(max=length - 1))
-            continue
-        if antialias:
-            matrix = _antialiased(length, count, step, mode)
-        else:
-            first = torch.arange(count, device=input.device).to(step.dtype)
-            source = step * first if align_corners else step * (first + 0.5) - 0.5
-            if mode == "bicubic":
-                input, matrix = _repeat_border(input, dimension), _cubic_matrix(length, source)
-            else:
-                matrix = _linear_matrix(length, source)
-        matrix = matrix.to(input.dtype)
-        input = matrix @ input if axis == 0 else input @ matrix.T
+        input = resample_side(input, dimension, count, step, mode, bool(align_corners), antialias)
     return input
+
+
+def resample_side(
+    input: Tensor, dimension: int, count: Any, step: Tensor, mode: str, align_corners: bool, antialias: bool
+) -> Tensor:
+    """One side of `resample`, -2 or -1, to `count` pixels that lie `step` () pixels of the input apart."""
+    length = input.shape[dimension]
+    if mode == "nearest":
+        places = torch.arange(count, device=input.device).to(step.dtype) * step
+        return input.index_select(dimension, places.floor().to(torch.int64).clamp(max=length - 1))
+    if antialias:
+        matrix = _antialiased(length, count, step, mode)
+    else:
+        first = torch.arange(count, device=input.device).to(step.dtype)
+        source = step * first if align_corners else step * (first + 0.5) - 0.5
+        if mode == "bicubic":
+            input, matrix = _repeat_border(input, dimension), _cubic_matrix(length, source)
+        else:
+            matrix = _linear_matrix(length, source)
+    matrix = matrix.to(input.dtype)
+    return matrix @ input if dimension == -2 else input @ matrix.T
 
 
 def _pair(value: Any) -> Any:
     return value if value is None or isinstance(value, (tuple, list)) else (value, value)
 
 
-def _scalar(value: Any, like: Tensor) -> Tensor:
+def scalar(value: Any, like: Tensor) -> Tensor:
     """A number or symbol as a tensor of float32 (float64 beside float64), so that it stays in the graph."""
     dtype = torch.promote_types(like.dtype, torch.float32)
     return torch.full((), value, dtype=dtype, device=like.device)
@@ -87,10 +94,10 @@ def _scalar(value: Any, like: Tensor) -> Tensor:
 def _step(length: Any, count: Any, factor: Any, align_corners: bool, like: Tensor) -> Tensor:
     """Pixels of the input per pixel of the output, () float."""
     if align_corners:
-        return _scalar(length - 1, like) / _scalar(count - 1, like).clamp(min=1)
+        return scalar(length - 1, like) / scalar(count - 1, like).clamp(min=1)
     if factor is not None:
-        return 1 / _scalar(factor, like)
-    return _scalar(length, like) / _scalar(count, like)
+        return 1 / scalar(factor, like)
+    return scalar(length, like) / scalar(count, like)
 
 
 def _columns(length: Any, like: Tensor, first: int = 0) -> Tensor:
@@ -99,7 +106,7 @@ def _columns(length: Any, like: Tensor, first: int = 0) -> Tensor:
 
 def _linear_matrix(length: Any, source: Tensor) -> Tensor:
     """(out, in): the two neighbors' weights."""
-    source = source.clamp(min=0).minimum(_scalar(length - 1, source))
+    source = source.clamp(min=0).minimum(scalar(length - 1, source))
     return (1 - (source[:, None] - _columns(length, source)).abs()).clamp(min=0)
 
 

@@ -73,8 +73,14 @@ def _search(z: Tensor, along: Tensor, square: Tensor, weight: Tensor) -> tuple[T
     grid = torch.linspace(math.log(NEAREST), math.log(FARTHEST), CANDIDATES, dtype=z.dtype, device=z.device).exp()
     shifts = scale.clamp(min=torch.finfo(torch.float32).tiny)[:, None] * grid - nearest[:, None]  # (B,C)
     inverse = _inverse(z[:, None] + shifts[..., None])
-    n, d = (along[:, None] * inverse).sum(-1), (square[:, None] * inverse.square()).sum(-1)
-    best = torch.where(d > 0, n.square() / torch.where(d > 0, d, 1.0), 0.0).argmax(1, keepdim=True)
+    # N^2 / D less what it is for points all at one distance, from what moves them off it: far away little does.
+    n, d = along.sum(1, keepdim=True), square.sum(1, keepdim=True)
+    plane = n / torch.where(d > 0, d, 1.0)
+    middle = (square[:, None] * inverse).sum(-1, keepdim=True) / torch.where(d > 0, d, 1.0)[..., None]
+    apart = inverse / torch.where(middle > 0, middle, 1.0) - 1
+    tilt, bend = ((along - plane * square)[:, None] * apart).sum(-1), (square[:, None] * apart.square()).sum(-1)
+    gain = (2 * n * tilt + tilt.square() - plane * n * bend) / torch.where(d > 0, d + bend, 1.0)
+    best = gain.argmax(1, keepdim=True)
     around = [shifts.gather(1, (best + turn).clamp(0, CANDIDATES - 1))[:, 0] for turn in (0, -1, 1)]
     return around[0], around[1], around[2], ((best > 0) & (best < CANDIDATES - 1))[:, 0]
 
@@ -84,9 +90,18 @@ def _inverse(depth: Tensor) -> Tensor:
 
 
 def _stationarity(z: Tensor, along: Tensor, square: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(B,) what is 0 where N^2 / D is extremal over the shift, the derivative of that, and N / D, the focal length."""
+    """(B,) what is 0 where N^2 / D is extremal over the shift, its derivative, and N / D, the focal length.
+
+    The first is (N D' - 2 N' D) / 2 D, and all are sums of what is small at each point, because products of the sums
+    are nearly equal and in a runtime without float64 their differences would have no digits.
+    """
     r = _inverse(z + shift[:, None])
-    n, n1, n2 = (along * r).sum(1), -(along * r**2).sum(1), 2 * (along * r**3).sum(1)
-    d, d1, d2 = (square * r**2).sum(1), -2 * (square * r**3).sum(1), 6 * (square * r**4).sum(1)
-    slope, curvature = 2 * n1 * d - n * d1, 2 * n2 * d + n1 * d1 - n * d2
-    return slope, curvature, torch.where(d > 0, n / torch.where(d > 0, d, 1.0), 1.0)
+    n, d = (along * r).sum(1), (square * r**2).sum(1)
+    safe = torch.where(d > 0, d, 1.0)
+    focal, middle = torch.where(d > 0, n / safe, 1.0), (square * r**3).sum(1) / safe
+    left = along - focal[:, None] * square * r  # of a point by f
+    left = left - ((left * r).sum(1) / safe)[:, None] * square * r  # and by what rounding took from f
+    apart = r - middle[:, None]
+    slope = (left * r * apart).sum(1)
+    curvature = focal * (square * r**2 * apart**2).sum(1) - 2 * (left * r * apart**2).sum(1) - 3 * middle * slope
+    return slope, curvature, focal

@@ -49,6 +49,33 @@ class MogeDepthEstimatorOutput(DepthEstimatorOutput):
     shift: torch.Tensor | None = None
 
 
+class _TokenGrid:
+    """Stands where MoGe-2 takes a number of tokens, n, and gives the rows and columns that are asked for.
+
+    The package works them out as round((n / aspect) ** 0.5) and round((n * aspect) ** 0.5).
+    """
+
+    def __init__(self, rows: int, columns: int) -> None:
+        self.rows, self.columns = rows, columns
+
+    def __truediv__(self, aspect: float) -> "_TokenSide":
+        return _TokenSide(self.rows)
+
+    def __mul__(self, aspect: float) -> "_TokenSide":
+        return _TokenSide(self.columns)
+
+
+class _TokenSide:
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __pow__(self, exponent: float) -> "_TokenSide":
+        return self
+
+    def __round__(self) -> int:
+        return self.count
+
+
 class MogeForDepthEstimation(PreTrainedModel):
     """MoGe and MoGe-2, around the network of the package dlr-moge."""
 
@@ -106,9 +133,20 @@ class MogeForDepthEstimation(PreTrainedModel):
             if name in ("cls_token", "pos_embed", "register_tokens", "mask_token"):
                 init.normal_(parameter, std=0.02)
 
+    @property
+    def num_tokens(self) -> int:
+        """Patches where a call gives no number: the config's, else the most that the network was trained for."""
+        stated = self.config.num_tokens
+        return int(self.network.num_tokens_range[1]) if stated is None else stated
+
     @can_return_tuple
     def forward(
-        self, pixel_values: torch.Tensor, labels: None = None, num_tokens: int | None = None, **kwargs: Any
+        self,
+        pixel_values: torch.Tensor,
+        labels: None = None,
+        num_tokens: int | None = None,
+        token_grid: tuple[int, int] | None = None,
+        **kwargs: Any,
     ) -> MogeDepthEstimatorOutput:
         """Depth, mask, points and, where it has the head, normals of images.
 
@@ -116,8 +154,11 @@ class MogeForDepthEstimation(PreTrainedModel):
             pixel_values (`torch.Tensor`): floats from 0 to 1 of shape (B, 3, H, W), of any size.
             num_tokens (`int`, *optional*): patches at the vision transformer; default the config's, else the most that
                 the network was trained for. Fewer are faster and coarser.
+            token_grid (`tuple[int, int]`, *optional*): rows and columns of the patches of MoGe-2, in place of those
+                that `num_tokens` gives for the picture's shape.
 
-        Raises ValueError for another shape, an integer dtype or no tokens, NotImplementedError for `labels`.
+        Raises ValueError for another shape, an integer dtype, no tokens or a grid for the first version,
+        NotImplementedError for `labels`.
         """
         if labels is not None:
             raise NotImplementedError("MogeForDepthEstimation has no loss of its own: leave labels out")
@@ -126,9 +167,15 @@ class MogeForDepthEstimation(PreTrainedModel):
             raise ValueError(f"pixel_values must be (B, 3, H, W), got {shape}")
         if not pixel_values.is_floating_point():
             raise ValueError(f"pixel_values must be floats from 0 to 1, got {pixel_values.dtype}")
-        most = int(self.network.num_tokens_range[1])
-        tokens = next(count for count in (num_tokens, self.config.num_tokens, most) if count is not None)
-        if tokens < 1:
+        tokens: Any = self.num_tokens if num_tokens is None else num_tokens
+        if token_grid is not None:
+            if self.config.version == "v1":
+                raise ValueError("token_grid: the first version of MoGe works its grid out of num_tokens alone")
+            rows, columns = token_grid
+            if rows < 1 or columns < 1:
+                raise ValueError(f"token_grid must be positive rows and columns, got {token_grid}")
+            tokens = _TokenGrid(rows, columns)
+        elif tokens < 1:
             raise ValueError(f"num_tokens must be positive, got {tokens}")
         output = self.network.forward(pixel_values, num_tokens=tokens)
         # A half-precision forward ends here: positions of a picture's points need more than its 8 bits.

@@ -10,6 +10,8 @@ Then what the targets cost once, with and without fills, in epochs of (e), and t
 """
 
 import argparse
+import ctypes
+import gc
 import os
 import statistics
 import tempfile
@@ -84,12 +86,21 @@ class Epochs:
         for method, step in self.steps.items():
             update = several if method != "e" else [part[:BATCH] for part in several]
             self.optimizer.zero_grad(set_to_none=True)
+            give_back()
             before = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
             profiling.reset_peak_memory(torch.device("cpu"))
             with channels_last_head(self.network, method != "b"):
                 step.accumulate(*update)
             peaks[method] = profiling.peak_memory(torch.device("cpu")) - before
         return peaks
+
+
+def give_back() -> None:
+    """To the system, what earlier updates left with the C library: it would hide what the next one takes."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
+    if trim:
+        trim(0)
 
 
 def seconds_of_targets(base: Path, groups: list, fills: int | None) -> float:

@@ -1,7 +1,8 @@
 """The tables of docs/surface-targets.md, from what `trials.py` left.
 
     python examples/tools/surface_targets/tables.py trials
-    python examples/tools/surface_targets/tables.py trials --against consensus
+    python examples/tools/surface_targets/tables.py trials --against "surface targets"
+    python examples/tools/surface_targets/tables.py trials --sets fresh_4 fresh_5 fresh_6
 
 A figure is the change of the mean RMSE against the base in percent: of each set and seed, then their mean. Intervals
 are bootstrap intervals over groups (2,000 draws of whole groups within each set, the same draws for all trials, so
@@ -34,6 +35,15 @@ def read(folder: Path) -> dict[str, list[dict]]:
         result = json.loads(path.read_text())
         trials[result["trial"]["name"]].append(result)
     return dict(trials)
+
+
+def of_sets(results: list[dict], names: list[str]) -> list[dict]:
+    """The results on these sets alone; those that were not scored on all of them are left out."""
+    return [
+        result | {"sets": {name: result["sets"][name] for name in names}}
+        for result in results
+        if result["sets"].keys() >= set(names)
+    ]
 
 
 def changes(results: list[dict], reference: str, region: str, kind: str | None, draws: bool) -> np.ndarray:
@@ -91,9 +101,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("trials", type=Path)
     parser.add_argument("--against", help="a trial: paired differences of all others to it")
+    parser.add_argument("--sets", nargs="+", help="only these, and trials scored on all of them")
     parser.add_argument("--no-intervals", action="store_true")
     args = parser.parse_args()
     trials = read(args.trials)
+    if args.sets:
+        chosen = {name: of_sets(results, args.sets) for name, results in trials.items()}
+        trials = {name: results for name, results in chosen.items() if results}
     heads = ["trial", "seeds", "photos", *(title for title, *_ in COLUMNS), "GCE", "alarm"]
     print(f"| {' | '.join(heads)} |\n|---|{'---:|' * (len(heads) - 1)}")
     for name, results in trials.items():

@@ -1,7 +1,7 @@
 """Train the embedded base in one of many ways on rendered groups, and score it on others.
 
     python examples/tools/surface_targets/trials.py --renders renders --out trials development
-    python examples/tools/surface_targets/trials.py --renders renders --out trials report --seeds 0 1 2
+    python examples/tools/surface_targets/trials.py --renders renders --out trials main --seeds 0 1 2
 
 A trial is a line of `plan.py`: which photos, what they are pulled to, and the weights. Every trial trains the same
 parts with the same number of updates unless its line says otherwise, keeps the last adapter, and scores it once on

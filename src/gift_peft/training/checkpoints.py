@@ -152,6 +152,7 @@ def restore(
         base = model.get_base_model().name_or_path
         if Path(base).is_dir() and pinned == earlier_revision(base):
             before["model_name_or_path"] = identity["model_name_or_path"]
+    before["channels_last"] = bool(before.get("channels_last"))  # where it is not told, the layout was PyTorch's own
     _check_identity(before, identity)
     if state.step > total_steps:
         raise ValueError(f"resume_from_checkpoint: {checkpoint} is past the {total_steps} steps of this run")

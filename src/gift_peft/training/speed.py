@@ -91,8 +91,8 @@ def tuned_for(device: torch.device, channels_last: bool | None, head: str) -> bo
     """Whether the head's convolutions train in channels-last layout: as asked, else where that is known to be faster.
 
     On CUDA bf16 convolutions want it, and cuDNN tries its algorithms out from now on; a run has images of one or two
-    sizes. On a CPU an update of the embedded base takes two thirds of the time with it, one of a large model about the
-    same. Raises ValueError where it is asked for a head that is not trained in full.
+    sizes. On a CPU an update of the embedded base takes about three quarters of the time with it, one of a
+    large model the same. Raises ValueError where it is asked for a head that is not trained in full.
     """
     if channels_last and head != "full":
         raise ValueError("channels_last is for a head that is trained in full (head: full)")

@@ -10,7 +10,7 @@ import torch
 from accelerate.state import AcceleratorState
 from safetensors.torch import load_file
 
-from gift_peft.training import TrainResult, train
+from gift_peft.training import TrainResult, checkpoints, train
 from gift_peft.training.arguments import GiftTrainingArguments
 
 
@@ -70,3 +70,14 @@ def train_again(args: GiftTrainingArguments, **changes) -> TrainResult:
 
 def rows_of(out):
     return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def tell(folder: Path, **identity) -> None:
+    """Change what a checkpoint says of its run; None takes it out."""
+    state = json.loads((folder / checkpoints.STATE).read_text())
+    said = state["identity"] | identity
+    state["identity"] = {name: value for name, value in said.items() if name not in identity or value is not None}
+    (folder / checkpoints.STATE).write_text(json.dumps(state))
+    sums = json.loads((folder / checkpoints.CHECKSUMS).read_text())
+    sums[checkpoints.STATE] = checkpoints._digest(folder / checkpoints.STATE)
+    (folder / checkpoints.CHECKSUMS).write_text(json.dumps(sums))

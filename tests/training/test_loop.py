@@ -7,7 +7,7 @@ import shutil
 import pytest
 import torch
 from helpers.booster_tree import write_root
-from helpers.runs import arguments, rows_of, train_again, weights
+from helpers.runs import arguments, rows_of, tell, train_again, weights
 from helpers.tiny import SIZE, tiny_processor, write_raw_tree
 from peft import PeftModel
 from safetensors.torch import load_file
@@ -265,3 +265,16 @@ def test_an_option_that_changes_the_bits_is_near_and_may_not_be_changed_on_the_w
         train_again(args, channels_last=False, max_steps=3)
     train_again(other, channels_last=None, max_steps=3)  # unless asked, a run keeps what it began with
     assert "channels_last: false" in (tmp_path / "plain/config.yaml").read_text()
+
+
+@pytest.mark.parametrize("told", [False, None])
+def test_a_checkpoint_that_does_not_tell_its_layout_goes_on_in_pytorchs_own(base_dir, tree, tmp_path, told):
+    """As written before channels-last was an option (None: nothing is told), or where it was not the default."""
+    out = tmp_path / "out"
+    args = arguments(base_dir, tree, out, max_steps=3, channels_last=False)
+    train(args)
+    tell(out / "checkpoint-3", channels_last=told)
+    with pytest.raises(ValueError, match="channels_last: False became True"):
+        train_again(args, channels_last=True, max_steps=4)
+    train_again(args, channels_last=None, max_steps=4)
+    assert "channels_last: false" in (out / "config.yaml").read_text()

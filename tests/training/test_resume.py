@@ -7,13 +7,12 @@ import shutil
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
 from accelerate import debug_launcher
 from accelerate.state import AcceleratorState
-from helpers.runs import arguments, assert_same_run, run_in_child, train_again, weights
+from helpers.runs import arguments, assert_same_run, run_in_child, tell, train_again, weights
 
 from gift_peft import cli
 from gift_peft.dataset.gift_i import dataset_fingerprint, load_gift_i
@@ -118,17 +117,6 @@ def test_interrupted_twice_the_last_checkpoint_is_the_same_to_the_byte(args, who
         assert (tmp_path / "out/checkpoint-4" / name).read_bytes() == (whole / "checkpoint-4" / name).read_bytes()
 
 
-def tell(folder, **identity):
-    """Change what a checkpoint says of its run; None takes it out."""
-    state = json.loads((folder / checkpoints.STATE).read_text())
-    said = state["identity"] | identity
-    state["identity"] = {name: value for name, value in said.items() if name not in identity or value is not None}
-    (folder / checkpoints.STATE).write_text(json.dumps(state))
-    sums = json.loads((folder / checkpoints.CHECKSUMS).read_text())
-    sums[checkpoints.STATE] = checkpoints._digest(folder / checkpoints.STATE)
-    (folder / checkpoints.CHECKSUMS).write_text(json.dumps(sums))
-
-
 def test_a_checkpoint_that_pins_the_files_of_its_base_goes_on(args, whole, base_dir, tmp_path):
     """As 0.1.0 wrote them."""
     out = shutil.copytree(whole, tmp_path / "out", ignore=shutil.ignore_patterns("checkpoint-4", "adapter-last"))
@@ -140,18 +128,6 @@ def test_a_checkpoint_that_pins_the_files_of_its_base_goes_on(args, whole, base_
     tell(out / "checkpoint-3", model_name_or_path=earlier_revision(base_dir))
     train_again(args)
     assert_same_run(out, whole)
-
-
-@pytest.mark.parametrize("told", [False, None])
-def test_a_checkpoint_that_does_not_tell_its_layout_goes_on_in_pytorchs_own(args, told):
-    """As written before channels-last was an option (None: nothing is told), or where it was not the default."""
-    out, args.channels_last, args.max_steps = Path(args.output_dir), False, 3
-    train(args)
-    tell(out / "checkpoint-3", channels_last=told)
-    with pytest.raises(ValueError, match="channels_last: False became True"):
-        train_again(args, channels_last=True, max_steps=4)
-    train_again(args, channels_last=None, max_steps=4)
-    assert "channels_last: false" in (out / "config.yaml").read_text()
 
 
 def test_a_closed_terminal_stops_no_run_started_with_nohup():

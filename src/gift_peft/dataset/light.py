@@ -1,6 +1,6 @@
 """A photo as if taken in other light: its brightness, contrast and colors changed by a draw that can be repeated.
 
-Where something is does not depend on the light, so the photo keeps its targets: few photos then teach more.
+Where something is does not depend on the light, so the photo keeps its targets.
 """
 
 import numpy as np

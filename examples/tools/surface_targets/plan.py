@@ -130,7 +130,6 @@ STAGES = {
         Trial("groups alone", TRAIN, (*OLD, *UNSEEN), **CHOSEN),
         Trial("groups alone, other light", TRAIN, (*OLD, *UNSEEN), jitter=0.3, **CHOSEN),
         Trial("groups and 1000 single photos", MANY, (*OLD, *UNSEEN, *FRESH), **CHOSEN),
-        Trial("groups and 1000 single photos, 16 epochs", MANY, (*OLD, *UNSEEN, *FRESH), **CHOSEN | {"epochs": 16}),
         Trial(
             "groups and 1000 single photos, 16 epochs, other light",
             MANY,

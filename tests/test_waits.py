@@ -5,6 +5,7 @@ it and the host is a wait. So that they do not creep back.
 """
 
 from contextlib import nullcontext
+from types import SimpleNamespace
 from unittest.mock import patch
 
 import pytest
@@ -89,7 +90,7 @@ class Accelerator:
 
 class Objective(Consensus):
     def __init__(self, step, optimizer):
-        self.step, self.optimizer = step, optimizer
+        self.step, self.optimizer, self.args = step, optimizer, SimpleNamespace(channels_last=False)
 
 
 def waits_of_an_update(num_images, num_processes, valid, retain):

@@ -61,7 +61,7 @@ def linspace(start: Any, end: Any, steps: Any, *, dtype: Any = None, device: Any
     first, last = scalar(start, like), scalar(end, like)
     step = (last - first) / scalar(steps - 1, like).clamp(min=1)
     index = torch.arange(steps, device=device)
-    points = torch.where(index < steps // 2, first + step * index, last - step * (steps - 1 - index))
+    points = torch.where(index < (steps + 1) // 2, first + step * index, last - step * (steps - 1 - index))
     return points.to(like.dtype)
 
 

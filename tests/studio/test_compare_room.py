@@ -40,7 +40,7 @@ def test_it_shows_what_the_model_predicts_at_the_scale(room, adapter, photo, sca
     model = DepthModel.from_pretrained(None, adapter)
     set_adapter_scale(model.network, scale)
     depths = model.depth_at(photo, base=True), model.depth_at(photo)
-    low, high = np.percentile(np.concatenate([depth.ravel() for depth in depths]), (1, 99))
+    low, high = np.percentile(np.concatenate([depth.ravel() for depth in depths]), (1, 99)).tolist()
     for picture, depth in zip((base, adapted), depths, strict=True):
         assert np.array_equal(np.asarray(picture), colorize(depth, low, high, "inverse_depth"))
     assert f"adapter at {scale:.2f}" in told and ("average 0.0%" in told) == (scale == 0)

@@ -188,16 +188,20 @@ def measure_loader(bench: Bench, seconds: float) -> float:
 def measure_options(bench: Bench, size: int, repeats: int, compiled: bool) -> dict[str, float]:
     """Median seconds for the gradient of one group, by default and under what is off by default."""
     variants = {
-        "PyTorch's layout": (None, "auto"),
-        "replay (retain=0)": (None, 0),
-        "all retained, blocks checkpointed": (checkpoint_blocks, size),
-        "channels-last head": (None, "auto"),
+        "PyTorch's layout": (None, "auto", False),
+        "replay (retain=0)": (None, 0, False),
+        "all retained, blocks checkpointed": (checkpoint_blocks, size, False),
+        "channels-last head": (None, "auto", True),
     }
     if compiled:
-        variants["compiled blocks"] = (compile_blocks, "auto")
+        variants["compiled blocks"] = (compile_blocks, "auto", False)
     group = bench.groups[bench.index[size]]
     medians = {}
-    for name, (change, retain) in variants.items():  # one model at a time beside the bench's: they are large
+    for name, (
+        change,
+        retain,
+        channels_last,
+    ) in variants.items():  # one model at a time beside the bench's: they are large
         model = get_gift_model(load_base(bench.base)[0]).to(bench.device).eval()
         if change:
             change(model)
@@ -205,7 +209,7 @@ def measure_options(bench: Bench, size: int, repeats: int, compiled: bool) -> di
         seconds = []
         for _ in range(repeats + 1):
             started = time.perf_counter()
-            with channels_last_head(model, name == "channels-last head"):
+            with channels_last_head(model, channels_last):
                 step.accumulate(group.pixel_values, group.mask, group.target)  # waits for the device at its end
             seconds.append(time.perf_counter() - started)
             model.zero_grad(set_to_none=True)

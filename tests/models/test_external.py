@@ -3,7 +3,6 @@
 import pickle
 import subprocess
 import sys
-import venv
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.booster_tree import write_root
+from helpers.environments import environment_beside_us, install
 from PIL import Image
 from torch import nn
 from transformers import DPTConfig, DPTForDepthEstimation, DPTImageProcessorPil
@@ -290,15 +290,10 @@ assert int(numpy.__version__.split(".")[0]) >= 2 and loaded.kind == "depth"
 @pytest.mark.slow
 def test_depth_anything_3_runs_beside_us_as_documented(tmp_path):
     """In a fresh environment that sees what is installed here; torchvision's wheel may be for another torch."""
-    venv.create(tmp_path / "env", with_pip=True)
-    python = tmp_path / "env" / "bin" / "python"
-    here = [path for path in sys.path if path.endswith("site-packages")] + [str(Path(__file__).parents[2] / "src")]
-    site = next((tmp_path / "env" / "lib").glob("python*/site-packages"))
-    (site / "here.pth").write_text("\n".join(here) + "\n")
+    python, _ = environment_beside_us(tmp_path / "env")
     for line in INSTALL_DA3:
-        words = [word for word in line.split()[1:] if word != "torchvision"]  # with it pip would bring another torch
-        done = subprocess.run([python, "-m", "pip", words[0], "-q", *words[1:]], capture_output=True, text=True)
-        if done.returncode:
-            pytest.skip(f"the package index does not answer: {done.stderr.strip().splitlines()[-1]}")
+        program, verb, *words = line.split()
+        assert (program, verb) == ("pip", "install")
+        install(python, [word for word in words if word != "torchvision"])  # with it pip would bring another torch
     done = subprocess.run([python, "-c", DA3_BESIDE_US, str(tmp_path / "da3")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

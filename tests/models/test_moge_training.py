@@ -1,14 +1,13 @@
 """MoGe through GIFT: what its own mask leaves out counts nowhere; trained on the embedded groups."""
 
 import json
-import sys
-import venv
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from helpers.adapted import depth, trained
+from helpers.environments import environment_beside_us, install
 from helpers.moge import tiny_moge, tiny_vit
 from helpers.runs import arguments
 from helpers.tiny import write_raw_tree
@@ -143,16 +142,10 @@ def test_the_documented_command_is_enough(tmp_path):
     """In a fresh environment that sees what is installed here: the packages named, and nothing else of theirs."""
     import subprocess
 
-    venv.create(tmp_path / "env", with_pip=True)
-    python = tmp_path / "env" / "bin" / "python"
-    here = [path for path in sys.path if path.endswith("site-packages")] + [str(Path(__file__).parents[2] / "src")]
-    site = next((tmp_path / "env" / "lib").glob("python*/site-packages"))
-    (site / "here.pth").write_text("\n".join(here) + "\n")
+    python, site = environment_beside_us(tmp_path / "env")
     words = INSTALL.split()
     assert words[:2] == ["pip", "install"] and "--no-deps" in words
-    done = subprocess.run([python, "-m", "pip", "install", "-q", *words[2:]], capture_output=True, text=True)
-    if done.returncode:
-        pytest.skip(f"the package index does not answer: {done.stderr.strip().splitlines()[-1]}")
+    install(python, words[2:])
     code = (
         "import sys, torch, cv2; from gift_peft import MogeConfig, MogeForDepthEstimation;"
         "model = MogeForDepthEstimation(MogeConfig(variant='moge-2-vits-normal')).eval();"

@@ -26,6 +26,14 @@ def dropped(tab, after="photo /"):
     tab.page.wait_for_function(script, arg=after)
 
 
+def capturing(browser, url):
+    """A tab that has pressed Start, and its room."""
+    tab = Watched(browser, url)
+    room = tab.page.locator("#capture")
+    room.get_by_role("button", name="Start").click()
+    return tab, room
+
+
 def fits(tab):
     return tab.page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
 
@@ -81,9 +89,7 @@ def test_photos_are_taken_one_is_dropped_and_the_mask_comes_next(browser, tmp_pa
 def test_keys_end_it_and_a_closed_tab_stops_the_camera(browser, tmp_path):
     source, raw = clip(tmp_path / "a.mp4", 4, 12), tmp_path / "raw"
     with studio(raw, "--source", source) as url:
-        tab = Watched(browser, url)
-        room = tab.page.locator("#capture")
-        room.get_by_role("button", name="Start").click()
+        tab, room = capturing(browser, url)
         room.get_by_role("button", name="Drop group_1/001.png").click()  # and the keys are still the room's
         dropped(tab, "")
         tab.page.keyboard.press("p")
@@ -168,9 +174,7 @@ def test_impatient_fingers_and_a_masks_room_that_was_there_before(browser, tmp_p
 def test_a_studio_that_is_gone_is_told_and_found_again(browser, tmp_path):
     source, raw = clip(tmp_path / "a.mp4", 4, 12), tmp_path / "raw"
     with studio(raw, "--source", source) as url:
-        tab = Watched(browser, url)
-        room = tab.page.locator("#capture")
-        room.get_by_role("button", name="Start").click()
+        tab, room = capturing(browser, url)
         room.locator(".strip li").first.wait_for()
     room.locator(".next").get_by_text("The studio does not answer: start it again.").wait_for()
     assert not room.locator(".live").is_visible()

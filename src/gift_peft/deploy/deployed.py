@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gift_peft.deploy.runtime import Predictor
+from gift_peft.deploy.runtime import Predictor, check_scale
 from gift_peft.images import read_image
 
 
@@ -37,9 +37,7 @@ class DeployedModel:
         if adapter_scale is not None:
             if not self.predictor.has_dial:
                 raise ValueError(f"{folder} was exported without --dial: its adapter scale is fixed")
-            if not -1 <= adapter_scale <= 1:
-                ends = "0 (the base) to 1 (the adapter), or down to -1"
-                raise ValueError(f"adapter scale {adapter_scale:g}: it goes from {ends}")
+            check_scale(adapter_scale)
         settings = self.predictor.settings
         self.size, self.kind, self.adapted = self.predictor.size, settings["kind"], self.predictor.has_dial
         self.millimeters_per_unit = settings.get("millimeters_per_unit") or 1.0

@@ -122,13 +122,18 @@ class Predictor:
         feeds = {self.settings["input"]["name"]: values}
         if self.has_dial:
             scale = 1.0 if scale is None else scale
-            if not -1 <= scale <= 1:
-                ends = "0 (the base) to 1 (the adapter), or down to -1"
-                raise ValueError(f"adapter scale {scale:g}: it goes from {ends}")
+            check_scale(scale)
             feeds[self.settings["dial"]["name"]] = np.array([scale], np.float32)
         elif scale is not None:
             raise ValueError("this model was exported without a dial: its adapter scale is fixed")
         return feeds
+
+
+def check_scale(scale: float) -> None:
+    """Raise ValueError for a scale to which no dial goes."""
+    if not -1 <= scale <= 1:
+        ends = "0 (the base) to 1 (the adapter), or down to -1"
+        raise ValueError(f"adapter scale {scale:g}: it goes from {ends}")
 
 
 def read_settings(folder: Path) -> dict:

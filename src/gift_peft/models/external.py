@@ -8,7 +8,6 @@ MoGe's own mask as `.valid_mask`. They cannot carry a GIFT adapter; MoGe convert
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -17,6 +16,7 @@ from transformers import DPTImageProcessorPil
 from transformers.modeling_outputs import DepthEstimatorOutput
 
 from gift_peft.files import reason
+from gift_peft.models.moge.modeling_moge import MogeDepthEstimatorOutput
 from gift_peft.models.moge.package_moge import INSTALL
 
 SIZE = (476, 644)  # of the paper's backbones; a multiple of the patches of both
@@ -114,10 +114,10 @@ def _load_moge(name: str) -> tuple[ExternalDepth, DPTImageProcessorPil]:
     return ExternalDepth(model, _predict_moge, config), _processor(do_normalize=False)
 
 
-def _predict_moge(network: Any, pixel_values: torch.Tensor) -> SimpleNamespace:
+def _predict_moge(network: Any, pixel_values: torch.Tensor) -> MogeDepthEstimatorOutput:
     # Unmasked: where MoGe masks, it says infinity, and a mirror is what it may mask.
     found = network.infer(pixel_values, apply_mask=False, use_fp16=False)
-    return SimpleNamespace(predicted_depth=found["depth"], valid_mask=found.get("mask"))
+    return MogeDepthEstimatorOutput(predicted_depth=found["depth"], valid_mask=found.get("mask"))
 
 
 # Its metadata asks for numpy below 2, xformers and open3d, which its networks do not use: it runs with numpy 2.

@@ -125,7 +125,12 @@ def saved_identity(checkpoint: Path) -> dict:
     """The `run_identity` of the run that wrote a checkpoint; empty where `restore` will refuse it."""
     saved = json.loads((checkpoint / STATE).read_text(encoding="utf-8"))
     identity = saved.get("identity") if isinstance(saved, dict) else None
-    return identity if isinstance(identity, dict) else {}
+    return _with_layout(identity) if isinstance(identity, dict) else {}
+
+
+def _with_layout(identity: dict) -> dict:
+    """Where it is not told, the head's layout was PyTorch's own."""
+    return identity | {"channels_last": bool(identity.get("channels_last"))}
 
 
 def restore(
@@ -145,14 +150,13 @@ def restore(
 
     saved = json.loads((checkpoint / STATE).read_text(encoding="utf-8"))
     try:
-        before, state = saved.pop("identity"), State(**saved)
+        before, state = _with_layout(saved.pop("identity")), State(**saved)
     except (KeyError, TypeError, AttributeError):
         raise ValueError(f"resume_from_checkpoint: {checkpoint} is of another version of gift-peft") from None
     if str(pinned := before.get("model_name_or_path")).startswith(FILES):  # 0.1.0 pinned files, not tensors
         base = model.get_base_model().name_or_path
         if Path(base).is_dir() and pinned == earlier_revision(base):
             before["model_name_or_path"] = identity["model_name_or_path"]
-    before["channels_last"] = bool(before.get("channels_last"))  # where it is not told, the layout was PyTorch's own
     _check_identity(before, identity)
     if state.step > total_steps:
         raise ValueError(f"resume_from_checkpoint: {checkpoint} is past the {total_steps} steps of this run")

@@ -101,7 +101,7 @@ def _train(args: GiftTrainingArguments, accelerator: Accelerator, resume_command
     before = checkpoints.saved_identity(checkpoint) if checkpoint else {}
     layout = tuned_for(accelerator.device, args.channels_last, args.head)
     if args.channels_last is None and before:  # unless asked, a run keeps what it began with
-        layout = bool(before.get("channels_last"))
+        layout = before["channels_last"]
     args = replace(args, channels_last=layout)
 
     # load: float32 weights whatever the checkpoint's, bf16 is autocast's business (paper, implementation details)

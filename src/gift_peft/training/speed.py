@@ -17,6 +17,7 @@ from transformers.modeling_layers import GradientCheckpointingLayer
 
 VARIANTS = 32  # of one block's forward that torch.compile may keep; past its limit it would fail
 LAYOUT_DEVICES = ("cpu", "cuda")  # where channels-last convolutions are known to be faster
+NO_HEAD = "channels_last is for a head that is trained in full (head: full)"
 FUSED_DEVICES = ("cpu", "cuda", "mps", "xpu")  # where PyTorch's Adam has one kernel for all weights
 
 
@@ -95,7 +96,7 @@ def tuned_for(device: torch.device, channels_last: bool | None, head: str) -> bo
     large model the same. Raises ValueError where it is asked for a head that is not trained in full.
     """
     if channels_last and head != "full":
-        raise ValueError("channels_last is for a head that is trained in full (head: full)")
+        raise ValueError(NO_HEAD)
     if device.type == "cuda":
         torch.backends.cudnn.benchmark = True
     return device.type in LAYOUT_DEVICES and head == "full" if channels_last is None else channels_last
@@ -113,7 +114,7 @@ def channels_last_head(model: PeftModel, wanted: bool = True) -> Iterator[None]:
     if wanted:
         heads = [module for module in model.modules() if isinstance(module, ModulesToSaveWrapper)]
         if not heads:
-            raise ValueError("channels_last is for a head that is trained in full (head: full)")
+            raise ValueError(NO_HEAD)
         for wrapper in heads:
             for module in wrapper.modules_to_save.modules():
                 if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):

@@ -75,8 +75,9 @@ def _search(z: Tensor, along: Tensor, square: Tensor, weight: Tensor) -> tuple[T
     inverse = _inverse(z[:, None] + shifts[..., None])
     # N^2 / D less what it is for points all at one distance, from what moves them off it: far away little does.
     n, d = along.sum(1, keepdim=True), square.sum(1, keepdim=True)
-    plane = n / torch.where(d > 0, d, 1.0)
-    middle = (square[:, None] * inverse).sum(-1, keepdim=True) / torch.where(d > 0, d, 1.0)[..., None]
+    safe = torch.where(d > 0, d, 1.0)
+    plane = n / safe
+    middle = (square[:, None] * inverse).sum(-1, keepdim=True) / safe[..., None]
     apart = inverse / torch.where(middle > 0, middle, 1.0) - 1
     tilt, bend = ((along - plane * square)[:, None] * apart).sum(-1), (square[:, None] * apart.square()).sum(-1)
     gain = (2 * n * tilt + tilt.square() - plane * n * bend) / torch.where(d > 0, d + bend, 1.0)

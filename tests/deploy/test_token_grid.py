@@ -2,13 +2,10 @@
 
 from fractions import Fraction
 
-import numpy as np
-import onnx_ir as ir
-import onnxruntime
-import openvino
 import pytest
 import torch
 from helpers.exports import limit, relative, write_adapter
+from helpers.grids import Grids
 from helpers.moge import tiny_moge, tiny_vit
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +16,7 @@ from gift_peft.deploy.onnx_export import deploy_onnx
 from gift_peft.deploy.openvino_export import deploy_openvino
 from gift_peft.deploy.resampling import resampled_by_matrices
 from gift_peft.deploy.runtime import Predictor
-from gift_peft.deploy.token_grid import GRID, compute_grid, linspace, positions
+from gift_peft.deploy.token_grid import linspace, positions
 from gift_peft.models.moge import MogeImageProcessorPil
 
 __all__ = ["tiny_vit"]  # a fixture
@@ -42,32 +39,9 @@ def python_grid(tokens: int, height: int, width: int) -> tuple[int, int]:
 
 @pytest.fixture(scope="module")
 def grids():
-    """{tokens: [rows and columns by onnxruntime, by OpenVINO]}, functions of height and width."""
-
-    def functions(tokens):
-        pixels = ir.val("pixel_values", dtype=ir.DataType.FLOAT, shape=ir.Shape(["batch", 3, "height", "width"]))
-        grid = ir.val(GRID, dtype=ir.DataType.FLOAT, shape=ir.Shape(["rows", "columns"]))
-        tape = ir.tape.Tape()
-        shape = tape.op("Shape", [grid])
-        shape.name, shape.dtype, shape.shape = "shape", ir.DataType.INT64, ir.Shape([2])
-        graph = ir.Graph([pixels, grid], [shape], nodes=tape.nodes, opset_imports={"": 20}, name="grid")
-        model = ir.Model(graph, ir_version=10)
-        compute_grid(model, tokens)
-        content = ir.to_proto(model).SerializeToString()
-        session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-        compiled = openvino.Core().compile_model(
-            openvino.Core().read_model(content), "CPU", {"INFERENCE_PRECISION_HINT": "f32"}
-        )
-
-        def feeds(height, width):
-            return {"pixel_values": np.zeros((1, 3, height, width), np.float32)}
-
-        return [
-            lambda *size: tuple(session.run(None, feeds(*size))[0].tolist()),
-            lambda *size: tuple(compiled(feeds(*size))[0].tolist()),
-        ]
-
-    return {tokens: functions(tokens) for tokens in TOKENS}
+    both = Grids()
+    with both.pool:
+        yield both
 
 
 @settings(max_examples=60, deadline=None)
@@ -75,21 +49,22 @@ def grids():
 def test_the_grid_is_pythons(grids, tokens, height, width):
     expected = python_grid(tokens, height, width)
     if 0 not in expected:  # of such a picture MoGe itself can make nothing
-        assert [grid(height, width) for grid in grids[tokens]] == [expected] * 2
+        assert grids(tokens, [(height, width)]) == [[expected] * 2]
 
 
 @pytest.mark.parametrize("tokens", TOKENS)
 def test_roots_that_end_in_a_half_are_rounded_as_python_does(grids, tokens):
-    ups = set()
+    expected, ups = {}, set()
     for k in range(1, 90):
         ratio = Fraction((2 * k + 1) ** 2, 4 * tokens)
         for times in (1, 2, 7):
             sides = ratio.numerator * times, ratio.denominator * times
             for height, width in (sides, sides[::-1]):
-                expected = python_grid(tokens, height, width)
-                if height * width < 2**22 and 0 not in expected:
-                    assert [grid(height, width) for grid in grids[tokens]] == [expected] * 2, (height, width)
-                    ups.add(expected[height == sides[1]] > k)
+                grid = python_grid(tokens, height, width)
+                if height * width < 2**22 and 0 not in grid:
+                    expected[height, width] = [grid] * 2
+                    ups.add(grid[height == sides[1]] > k)
+    assert dict(zip(expected, grids(tokens, list(expected)), strict=True)) == expected
     assert ups == {False, True}
 
 

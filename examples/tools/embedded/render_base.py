@@ -2,10 +2,12 @@
 
     pip install -e ".[render]"
     python examples/tools/embedded/render_base.py --out renders/base --count 5400 --processes 2
+    python examples/tools/embedded/render_base.py --out renders/bare --count 2400 --without_twins
 
 Opaque twins of every kind of target stand where the groups have their mirrors, panes and glass objects, as do empty
-frames and doorways one really can look through. One .npz per scene (two views each): `image` (2, 140, 175, 3) uint8
-and `depth` (2, 140, 175) uint16, z-depth in millimetres. Finished scenes are skipped, so it may be interrupted.
+frames and doorways one really can look through; `--without_twins` leaves the twins away. One .npz per scene (two views
+each): `image` (2, 140, 175, 3) uint8 and `depth` (2, 140, 175) uint16, z-depth in millimetres. Finished scenes are
+skipped, so it may be interrupted.
 """
 
 import argparse
@@ -75,16 +77,39 @@ def near_scene(rng):
     return scene, target.centre
 
 
-def views(seed: int):
+def bare_scene(rng):
+    """A furnished room in which nothing is flat and stands free, hangs on a wall, or is round: no twin of any target.
+
+    Chairs, tables, boxes, cartons, books, cabinets and empty frames are left.
+    """
+    import rooms
+    import targets
+
+    scene = rooms.make_room(rng)
+    frame = targets.standing_panel(rng, scene, see_through=True) if rng.random() < 0.4 else None
+    if frame is not None:
+        scene.items += frame.holder
+        if rng.random() < 0.8:
+            targets.aim(rng, scene, frame.centre)
+    rooms.furnish(rng, scene, keep_clear=[] if frame is None else [tuple(frame.centre[:2])], pictures=False)
+    scene.items = [item for item in scene.items if item.shape["type"] not in ("sphere", "mesh")]
+    return scene
+
+
+def views(seed: int, twins: bool = True):
     """Two pictures and z-depths of one scene, each with its own light: the planned view and one turned away.
 
     From `FIRST_NEAR` on the scenes are near ones, and the second view only shifts the target within the picture.
+    Without `twins` every scene is a bare one, with views as of a room at large.
     """
     import targets
     import tracer
 
     rng = np.random.default_rng([20260101, seed])
-    scene, centre = near_scene(rng) if seed >= FIRST_NEAR else (opaque_scene(rng), None)
+    if twins and seed >= FIRST_NEAR:
+        scene, centre = near_scene(rng)
+    else:
+        scene, centre = opaque_scene(rng) if twins else bare_scene(rng), None
     images, depths = [], []
     for view in range(2):
         if view and centre is not None:
@@ -106,8 +131,8 @@ def views(seed: int):
 
 
 def work(task) -> int:
-    seed, path = task
-    rendered = views(seed)
+    seed, path, twins = task
+    rendered = views(seed, twins)
     temporary = path.with_suffix(".part.npz")
     if rendered is None:
         np.savez(temporary, image=np.zeros((0, 140, 175, 3), np.uint8), depth=np.zeros((0, 140, 175), np.uint16))
@@ -122,10 +147,12 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("renders/base"))
     parser.add_argument("--count", type=int, default=5400, help="pictures, two per scene")
     parser.add_argument("--first", type=int, default=0, help=f"seed to begin with; near scenes from {FIRST_NEAR} on")
+    parser.add_argument("--without_twins", action="store_true", help="nothing that is like any target")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    paths = [(seed, args.out / f"{seed:05d}.npz") for seed in range(args.first, args.first + args.count // 2)]
+    seeds = range(args.first, args.first + args.count // 2)
+    paths = [(seed, args.out / f"{seed:05d}.npz", not args.without_twins) for seed in seeds]
     tasks = [task for task in paths if not task[1].exists()]
     with ProcessPoolExecutor(args.processes) as pool:
         list(tqdm(pool.map(work, tasks), total=len(tasks), unit="scene"))

@@ -284,7 +284,7 @@ def make_room(rng, far_range=(2.4, 6.0), rear_range=(1.2, 2.4), openings=1.0) ->
     return Scene(items, camera, light, (left, right, rear, far, height), [])
 
 
-def furnish(rng, scene: Scene, count=None, keep_clear=()) -> None:
+def furnish(rng, scene: Scene, count=None, keep_clear=(), pictures=True) -> None:
     """Fill the room: pieces along the walls, free ones in view, a few behind the camera, pictures on the walls."""
     left, right, rear, far, _ = scene.room
     for _ in range(rng.integers(0, 4)):
@@ -297,7 +297,7 @@ def furnish(rng, scene: Scene, count=None, keep_clear=()) -> None:
         spot = free_spot(rng, scene, 0.4, (left + 0.4, right - 0.4), (rear + 0.3, -0.3))
         if spot is not None:
             scene.items += furniture(rng, *spot)
-    for _ in range(rng.integers(0, 4)):
+    for _ in range(rng.integers(0, 4) if pictures else 0):
         hang_picture(rng, scene)
 
 

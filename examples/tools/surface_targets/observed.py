@@ -65,8 +65,8 @@ class Observed:
 
 
 def read_set(folder: Path, base: Path, fills: int = FILLS) -> list[Observed]:
-    """All groups of a set, in the order of their names; what was predicted before is read from `<set>.observed/`."""
-    store = folder.with_name(folder.name + ".observed")
+    """All groups of a set, in the order of their names; what was predicted before is read from `<set>.<base>/`."""
+    store = folder.with_name(f"{folder.name}.{base.parent.name}.{base.name}")
     store.mkdir(exist_ok=True)
     names = sorted(path.parent.name for path in folder.glob("*/group.json"))
     model = None

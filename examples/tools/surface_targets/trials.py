@@ -5,7 +5,7 @@
 
 A trial is a line of `plan.py`: which photos, what they are pulled to, and the weights. Every trial trains the same
 parts with the same number of updates unless its line says otherwise, keeps the last adapter, and scores it once on
-each set; finished ones are skipped. `tables.py` reads what stands in `--out`.
+each set, and on the sets of `--also`; finished ones are skipped. `tables.py` reads what stands in `--out`.
 """
 
 import argparse
@@ -21,7 +21,7 @@ import torch
 from observed import SIZE, Observed, read_set
 from tqdm import tqdm
 
-from gift_peft import GroupStep, evaluate_gift_i, get_gift_model
+from gift_peft import GroupStep, evaluate_gift_i, get_gift_model, save_adapter
 from gift_peft.dataset.light import in_light
 from gift_peft.dataset.loader import epoch_flips, epoch_order
 from gift_peft.evaluation.alignment import align
@@ -78,11 +78,11 @@ def kept_maps(store: Path, groups: list[Observed], rule: plan.Rule, flipped: boo
     return torch.load(path)
 
 
-def train(trial: plan.Trial, groups: list[Observed], seed: int, store: Path):
-    """The network with its trained adapter, its image processor, and seconds of training."""
-    base, processor = load_base(BASE)
+def train(trial: plan.Trial, groups: list[Observed], seed: int, store: Path, base: Path):
+    """The model with its trained adapter, and seconds of training."""
+    model, processor = load_base(base)
     torch.manual_seed(seed)
-    network = get_gift_model(base).eval()
+    network = get_gift_model(model).eval()
     parameters = [p for p in network.parameters() if p.requires_grad]
     optimizer = torch.optim.Adam(parameters, lr=trial.rate)
     helper = DepthModel(network, processor, SIZE)
@@ -214,17 +214,26 @@ def score_maps(rule: plan.Rule, groups: list[Observed]) -> list[dict]:
     return rows
 
 
-def run(trial: plan.Trial, seed: int, sets: dict[str, list[Observed]], out: Path) -> None:
+def run(trial: plan.Trial, seed: int, sets: dict[str, list[Observed]], out: Path, base: Path, scored) -> None:
+    """Train, keep the adapter, and add the scores on the sets that are missing in the trial's result."""
     path = out / f"{trial.name.replace(' ', '_').replace('/', '-')}.{seed}.json"
-    if path.exists():
+    result = json.loads(path.read_text()) if path.exists() else {}
+    keys = {name if part == "all" else f"{name}:{part}": (name, part) for name, part in scored}
+    missing = keys.keys() - result.get("sets", {}).keys()
+    if not missing:
         return
-    groups = [group for name, part in trial.train for group in plan.part(sets[name], part)]
-    groups = choose(groups, trial.photos)
-    model, seconds = train(trial, groups, seed, out)
-    result = {"trial": trial.describe(), "seed": seed, "photos": sum(len(group.images) for group in groups)}
-    result |= {"groups": len(groups), "train_seconds": seconds, "sets": {}}
-    for name, part in trial.score:
-        result["sets"][name if part == "all" else f"{name}:{part}"] = score(model, plan.part(sets[name], part))
+    adapter = path.with_suffix("")
+    if adapter.exists():
+        model = DepthModel.from_pretrained(base, adapter, size=SIZE)
+    else:
+        groups = [group for name, part in trial.train for group in plan.part(sets[name], part)]
+        groups = choose(groups, trial.photos)
+        model, seconds = train(trial, groups, seed, out, base)
+        save_adapter(model.network, adapter, str(base), processor=model.processor, size=SIZE)
+        result |= {"trial": trial.describe(), "seed": seed, "photos": sum(len(group.images) for group in groups)}
+        result |= {"groups": len(groups), "train_seconds": seconds}
+    for key in sorted(missing):
+        result.setdefault("sets", {})[key] = score(model, plan.part(sets[keys[key][0]], keys[key][1]))
     temporary = path.with_suffix(".part")
     temporary.write_text(json.dumps(result))
     os.replace(temporary, path)
@@ -235,17 +244,20 @@ def main():
     parser.add_argument("stage", choices=sorted(plan.STAGES))
     parser.add_argument("--renders", type=Path, default=Path("renders"))
     parser.add_argument("--out", type=Path, default=Path("trials"))
+    parser.add_argument("--base", type=Path, default=BASE, help="another base model; its own --out")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--only", help="the one of this name")
+    parser.add_argument("--also", nargs="+", default=[], help="sets to score on besides the trial's own")
     args = parser.parse_args()
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "2")))
     args.out.mkdir(parents=True, exist_ok=True)
     trials = [trial for trial in plan.STAGES[args.stage] if args.only in (None, trial.name)]
-    needed = sorted({name for trial in trials for name, _ in (*trial.train, *trial.score)})
-    sets = {name: read_set(args.renders / name, BASE) for name in needed}
+    also = tuple((name, "all") for name in args.also)
+    needed = sorted({name for trial in trials for name, _ in (*trial.train, *trial.score, *also)})
+    sets = {name: read_set(args.renders / name, args.base) for name in needed}
     for seed in args.seeds:
         for trial in trials:
-            run(trial, seed, sets, args.out)
+            run(trial, seed, sets, args.out, args.base, (*trial.score, *also))
 
 
 if __name__ == "__main__":

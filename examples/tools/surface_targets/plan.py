@@ -137,6 +137,15 @@ STAGES = {
             jitter=0.3,
             **CHOSEN | {"epochs": 16},
         ),
+        Trial(
+            "groups and 1000 single photos, 16 epochs, other light, quantile for all",
+            MANY,
+            (*OLD, *UNSEEN, *FRESH),
+            rule=Rule("quantile"),
+            jitter=0.3,
+            **CHOSEN | {"epochs": 16},
+        ),
+        Trial("groups alone, quantile for all", TRAIN, (*OLD, *UNSEEN), rule=Rule("quantile"), **CHOSEN),
     ],
     # The paper's objective over the grid, on the older validation groups.
     "paper's grid": [

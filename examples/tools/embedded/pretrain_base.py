@@ -59,6 +59,9 @@ def build_model() -> DepthAnythingForDepthEstimation:
             depth_estimation_type="relative",
         )
     )
+    for module in (*model.neck.modules(), *model.head.modules()):  # transformers' 0.02 lets narrow layers fall silent
+        if isinstance(module, (torch.nn.Conv2d, torch.nn.ConvTranspose2d)):
+            module.reset_parameters()
     with torch.no_grad():  # start from a plausible constant, away from the final ReLU's dead side
         model.head.conv3.weight.abs_()
         model.head.conv3.bias.fill_(0.3)

@@ -61,6 +61,8 @@ MANY = (*TRAIN, ("singles", 1000))
 FRESH = (("fresh_1", "all"), ("fresh_2", "all"), ("fresh_3", "all"))
 UNSEEN = (("fresh_4", "all"), ("fresh_5", "all"), ("fresh_6", "all"))  # rendered after FRESH had been looked at
 
+CYCLES, SCORED_CYCLES = (("blender_train", "all"),), (("blender", "all"),)
+
 
 def first(name: str, **options) -> Trial:
     return Trial(name, TRAIN, OLD, **options)
@@ -146,6 +148,11 @@ STAGES = {
             **CHOSEN | {"epochs": 16},
         ),
         Trial("groups alone, quantile for all", TRAIN, (*OLD, *UNSEEN), rule=Rule("quantile"), **CHOSEN),
+    ],
+    # Photos of the other renderer's own rooms (blender_groups.py, other seeds), scored on that renderer's groups.
+    "renderer": [
+        Trial("surface targets, the renderer's own", CYCLES, SCORED_CYCLES, updates=2196, **CHOSEN),
+        Trial("paper's objective, the renderer's own", CYCLES, SCORED_CYCLES, updates=2196, **CHOSEN | PAPER),
     ],
     # The paper's objective over the grid, on the older validation groups.
     "paper's grid": [

@@ -204,16 +204,6 @@ def score(model: DepthModel, groups: list[Observed]) -> dict:
     return result
 
 
-def score_maps(rule: plan.Rule, groups: list[Observed]) -> list[dict]:
-    """Per image the error inside the target of the base and of the target maps themselves, against true depth."""
-    rows = []
-    for group in groups:
-        maps = target_maps(group, rule, False)
-        for index, pair in enumerate(zip(base_errors(group), base_errors(group, maps), strict=True)):
-            rows.append({"group_id": group.name, "image": index, "kind": group.kind, "rmse": pair})
-    return rows
-
-
 def run(trial: plan.Trial, seed: int, sets: dict[str, list[Observed]], out: Path, base: Path, scored) -> None:
     """Train, keep the adapter, and add the scores on the sets that are missing in the trial's result."""
     path = out / f"{trial.name.replace(' ', '_').replace('/', '-')}.{seed}.json"

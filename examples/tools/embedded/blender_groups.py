@@ -14,10 +14,10 @@ horizontal field of view of 60 degrees, as the base knows no other, and an eye 1
 
 Within a group the camera, the target and all that the camera sees around it stay. Things behind the camera move,
 things come and go behind a pane or glass object (only where they are seen through it alone), and lamps and daylight
-change. The glass is clean and its surface invisible, but in a quarter of the groups one observation is covered (a
-sheet on the mirror, a card behind the pane, paint inside the glass): `surface_seen`. Pictures are path-traced at twice
-the size, 4 samples a pixel there, and denoised (OpenImageDenoise, with albedo and normals), then made plain sRGB
-(Blender's view transform "Standard") by an automatic exposure that errs a little.
+change. The glass is clean: of its surface only reflections show. But in a quarter of the groups one observation is
+covered (a sheet on the mirror, a card behind the pane, paint inside the glass): `surface_seen`. Pictures are
+path-traced at twice the size, 4 samples a pixel there, and denoised (OpenImageDenoise, with albedo and normals), then
+made plain sRGB (Blender's view transform "Standard") by an automatic exposure that errs a little.
 """
 
 import argparse

@@ -9,6 +9,8 @@
     python examples/tools/embedded/pretrain_base.py --renders renders/near --out renders/model \\
         --init renders/second/base --steps 1600 --learning_rate 6e-4
 
+    python examples/tools/embedded/pretrain_base.py --renders renders/bare --out renders/bare_model --steps 1700
+
 Weighted L1 and a multi-scale gradient loss on inverse depth, AdamW with a one-cycle schedule, flips and colour jitter,
 an exponential average of the weights, bf16 autocast where the CPU has it; `torch.compile` needs a C++ compiler. The
 first `--held_out` scene files (some are empty: no view turned out well) are never trained on; every 500 steps it

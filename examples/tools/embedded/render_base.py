@@ -2,12 +2,12 @@
 
     pip install -e ".[render]"
     python examples/tools/embedded/render_base.py --out renders/base --count 5400 --processes 2
-    python examples/tools/embedded/render_base.py --out renders/bare --count 2400 --without_twins
+    python examples/tools/embedded/render_base.py --out renders/bare --count 5400 --without_twins
 
 Opaque twins of every kind of target stand where the groups have their mirrors, panes and glass objects, as do empty
-frames and doorways one really can look through; `--without_twins` leaves the twins away. One .npz per scene (two views
-each): `image` (2, 140, 175, 3) uint8 and `depth` (2, 140, 175) uint16, z-depth in millimetres. Finished scenes are
-skipped, so it may be interrupted.
+frames and doorways one really can look through; `--without_twins` leaves the twins away (into an `--out` of its own).
+One .npz per scene (two views each): `image` (2, 140, 175, 3) uint8 and `depth` (2, 140, 175) uint16, z-depth in
+millimetres. Finished scenes are skipped, so it may be interrupted.
 """
 
 import argparse
@@ -78,9 +78,9 @@ def near_scene(rng):
 
 
 def bare_scene(rng):
-    """A furnished room in which nothing is flat and stands free, hangs on a wall, or is round: no twin of any target.
+    """A furnished room without any target's twin, picture or round thing (balls, vessels, lamps, plants, stools).
 
-    Chairs, tables, boxes, cartons, books, cabinets and empty frames are left.
+    Chairs, tables, boxes, cartons, books, cabinets, doorways and empty frames are left.
     """
     import rooms
     import targets
@@ -147,7 +147,7 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("renders/base"))
     parser.add_argument("--count", type=int, default=5400, help="pictures, two per scene")
     parser.add_argument("--first", type=int, default=0, help=f"seed to begin with; near scenes from {FIRST_NEAR} on")
-    parser.add_argument("--without_twins", action="store_true", help="nothing that is like any target")
+    parser.add_argument("--without_twins", action="store_true", help="no twin of a target, no picture, nothing round")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)

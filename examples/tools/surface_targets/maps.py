@@ -3,7 +3,8 @@
     python examples/tools/surface_targets/maps.py --renders renders --sets train validation
 
 The base's error inside the target on the photos and on the treated reference, and how each rule's maps, in place of
-the base's prediction, change the former: mean RMSE against true depth, aligned over the whole picture.
+the base's prediction, change the former: mean RMSE against true depth, aligned over the whole picture. With `--base`
+those of another base model.
 """
 
 import argparse

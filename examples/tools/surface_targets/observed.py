@@ -5,6 +5,7 @@ prediction of the photo, of its mirror image and of its fills (both ways round),
 and the renderer's own record of whether the surface can be seen.
 """
 
+import hashlib
 import json
 import os
 from dataclasses import dataclass, fields
@@ -64,9 +65,14 @@ class Observed:
         )
 
 
+def fingerprint(base: Path) -> str:
+    """Eight hex digits of a base model's weights."""
+    return hashlib.blake2b((base / "model.safetensors").read_bytes(), digest_size=4).hexdigest()
+
+
 def read_set(folder: Path, base: Path, fills: int = FILLS) -> list[Observed]:
     """All groups of a set, in the order of their names; what was predicted before is read from `<set>.<base>/`."""
-    store = folder.with_name(f"{folder.name}.{base.parent.name}.{base.name}")
+    store = folder.with_name(f"{folder.name}.{fingerprint(base)}")
     store.mkdir(exist_ok=True)
     names = sorted(path.parent.name for path in folder.glob("*/group.json"))
     model = None

@@ -149,7 +149,8 @@ STAGES = {
         ),
         Trial("groups alone, quantile for all", TRAIN, (*OLD, *UNSEEN), rule=Rule("quantile"), **CHOSEN),
     ],
-    # Photos of the other renderer's own rooms (blender_groups.py, other seeds), scored on that renderer's groups.
+    # Photos of the other renderer's own rooms (blender_groups.py, other seeds), scored on that renderer's groups; all
+    # with the updates of surface targets in the main runs.
     "renderer": [
         Trial("surface targets, the renderer's own", CYCLES, SCORED_CYCLES, updates=2196, **CHOSEN),
         Trial("paper's objective, the renderer's own", CYCLES, SCORED_CYCLES, updates=2196, **CHOSEN | PAPER),

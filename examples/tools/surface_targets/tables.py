@@ -6,7 +6,8 @@
 
 A figure is the change of the mean RMSE against the base in percent: of each set and seed, then their mean. Intervals
 are bootstrap intervals over groups (2,000 draws of whole groups within each set, the same draws for all trials, so
-that differences are paired); seeds of one trial are averaged within a draw.
+that differences are paired, and the same places in each set, which makes them somewhat too wide); seeds of one trial
+are averaged within a draw.
 """
 
 import argparse
@@ -35,6 +36,11 @@ def read(folder: Path) -> dict[str, list[dict]]:
         result = json.loads(path.read_text())
         trials[result["trial"]["name"]].append(result)
     return dict(trials)
+
+
+def own_sets(result: dict) -> list[str]:
+    """The sets of a trial's line in the plan, without those of `--also`."""
+    return [name if part == "all" else f"{name}:{part}" for name, part in result["trial"]["score"]]
 
 
 def of_sets(results: list[dict], names: list[str]) -> list[dict]:
@@ -101,13 +107,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("trials", type=Path)
     parser.add_argument("--against", help="a trial: paired differences of all others to it")
-    parser.add_argument("--sets", nargs="+", help="only these, and trials scored on all of them")
+    parser.add_argument("--sets", nargs="+", help="these, and trials scored on all of them; default: each trial's own")
     parser.add_argument("--no-intervals", action="store_true")
     args = parser.parse_args()
-    trials = read(args.trials)
-    if args.sets:
-        chosen = {name: of_sets(results, args.sets) for name, results in trials.items()}
-        trials = {name: results for name, results in chosen.items() if results}
+    chosen = {name: of_sets(results, args.sets or own_sets(results[0])) for name, results in read(args.trials).items()}
+    trials = {name: results for name, results in chosen.items() if results}
+    if args.against and args.against not in trials:
+        parser.error(f"--against {args.against}: no such trial was scored on these sets")
     heads = ["trial", "seeds", "photos", *(title for title, *_ in COLUMNS), "GCE", "alarm"]
     print(f"| {' | '.join(heads)} |\n|---|{'---:|' * (len(heads) - 1)}")
     for name, results in trials.items():

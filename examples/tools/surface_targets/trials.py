@@ -5,7 +5,7 @@
 
 A trial is a line of `plan.py`: which photos, what they are pulled to, and the weights. Every trial trains the same
 parts with the same number of updates unless its line says otherwise, keeps the last adapter, and scores it once on
-each set, and on the sets of `--also`; finished ones are skipped. `tables.py` reads what stands in `--out`.
+each set and on those of `--also`; finished ones are skipped. `tables.py` reads what stands in `--out`.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import plan
 import torch
-from observed import SIZE, Observed, read_set
+from observed import SIZE, Observed, fingerprint, read_set
 from tqdm import tqdm
 
 from gift_peft import GroupStep, evaluate_gift_i, get_gift_model, save_adapter
@@ -205,25 +205,30 @@ def score(model: DepthModel, groups: list[Observed]) -> dict:
 
 
 def run(trial: plan.Trial, seed: int, sets: dict[str, list[Observed]], out: Path, base: Path, scored) -> None:
-    """Train, keep the adapter, and add the scores on the sets that are missing in the trial's result."""
+    """Train, keep the adapter, and add the scores on the sets that are missing in the trial's result.
+
+    Raises SystemExit where a result of another trial or base has the name.
+    """
     path = out / f"{trial.name.replace(' ', '_').replace('/', '-')}.{seed}.json"
-    result = json.loads(path.read_text()) if path.exists() else {}
-    keys = {name if part == "all" else f"{name}:{part}": (name, part) for name, part in scored}
-    missing = keys.keys() - result.get("sets", {}).keys()
-    if not missing:
-        return
     adapter = path.with_suffix("")
-    if adapter.exists():
+    described = json.loads(json.dumps(trial.describe())) | {"base": fingerprint(base)}
+    result = json.loads(path.read_text()) if path.exists() else None
+    if result and result["trial"] | {"score": 0} != described | {"score": 0}:
+        raise SystemExit(f"{path} is of another trial or base: take another --out")
+    keys = {name if part == "all" else f"{name}:{part}": (name, part) for name, part in scored}
+    if result and keys.keys() <= result["sets"].keys():
+        return
+    if result and adapter.exists():
         model = DepthModel.from_pretrained(base, adapter, size=SIZE)
-    else:
+    else:  # without its adapter a result cannot be added to
         groups = [group for name, part in trial.train for group in plan.part(sets[name], part)]
         groups = choose(groups, trial.photos)
         model, seconds = train(trial, groups, seed, out, base)
         save_adapter(model.network, adapter, str(base), processor=model.processor, size=SIZE)
-        result |= {"trial": trial.describe(), "seed": seed, "photos": sum(len(group.images) for group in groups)}
-        result |= {"groups": len(groups), "train_seconds": seconds}
-    for key in sorted(missing):
-        result.setdefault("sets", {})[key] = score(model, plan.part(sets[keys[key][0]], keys[key][1]))
+        result = {"trial": described, "seed": seed, "photos": sum(len(group.images) for group in groups)}
+        result |= {"groups": len(groups), "train_seconds": seconds, "sets": {}}
+    for key in sorted(keys.keys() - result["sets"].keys()):
+        result["sets"][key] = score(model, plan.part(sets[keys[key][0]], keys[key][1]))
     temporary = path.with_suffix(".part")
     temporary.write_text(json.dumps(result))
     os.replace(temporary, path)
@@ -234,7 +239,7 @@ def main():
     parser.add_argument("stage", choices=sorted(plan.STAGES))
     parser.add_argument("--renders", type=Path, default=Path("renders"))
     parser.add_argument("--out", type=Path, default=Path("trials"))
-    parser.add_argument("--base", type=Path, default=BASE, help="another base model; its own --out")
+    parser.add_argument("--base", type=Path, default=BASE, help="another base model")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--only", help="the one of this name")
     parser.add_argument("--also", nargs="+", default=[], help="sets to score on besides the trial's own")

@@ -197,11 +197,8 @@ def measure_options(bench: Bench, size: int, repeats: int, compiled: bool) -> di
         variants["compiled blocks"] = (compile_blocks, "auto", False)
     group = bench.groups[bench.index[size]]
     medians = {}
-    for name, (
-        change,
-        retain,
-        channels_last,
-    ) in variants.items():  # one model at a time beside the bench's: they are large
+    # One model at a time beside the bench's: they are large.
+    for name, (change, retain, channels_last) in variants.items():
         model = get_gift_model(load_base(bench.base)[0]).to(bench.device).eval()
         if change:
             change(model)

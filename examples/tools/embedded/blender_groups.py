@@ -17,11 +17,11 @@ things come and go behind a pane or glass object (only where they are seen throu
 change. The glass is clean: of its surface only reflections show. But in a quarter of the groups one observation is
 covered (a sheet on the mirror, a card behind the pane, paint inside the glass): `surface_seen`. Pictures are
 path-traced at twice the size, 4 samples a pixel there, and denoised (OpenImageDenoise, with albedo and normals), then
-made plain sRGB (Blender's view transform "Standard") by an automatic exposure that errs a little.
+made plain sRGB (Blender's view transform "Standard") by an automatic exposure that errs a little. Masks and depths
+are the same in every run; Blender's pictures may differ a little.
 """
 
 import argparse
-import json
 import os
 import tempfile
 from contextlib import contextmanager
@@ -33,17 +33,16 @@ import numpy as np
 from blender_rooms import furnish, furniture, light, ornament
 from blender_shapes import Look, place, points
 from blender_targets import MAKERS, clear_look, covered_look, matte_look
+from group_files import ATTEMPTS, KEPT, KINDS, first_group, write_group
 from mathutils import Vector
 from PIL import Image, ImageFilter
 from tqdm import tqdm
 
-SURFACES = {"mirror": "mirror", "pane": "transparent", "solid": "transparent"}
-WIDTH, HEIGHT = 140, 112
+WIDTH, HEIGHT = KEPT
 FIELD_OF_VIEW = radians(60)  # horizontal
 FOCAL = WIDTH / 2 / tan(FIELD_OF_VIEW / 2)
 OBSERVATIONS, COVERED = 3, 0.25
 SAMPLES, ENLARGED = 4, 2
-JPEG = {"quality": 95, "optimize": True, "progressive": True}
 
 
 class Camera:
@@ -282,7 +281,8 @@ def make_group(seed: int, kind: str, folder: Path):
             return None
         images.append(photo(folder, number + 1, rng.uniform(0.8, 1.3)))
         discard(things)
-    return {"images": images, "mask": mask, "depth": depth, "reference": reference, "shown": shown}
+    depths = [np.round(depth * 1000).astype(np.uint16)] * OBSERVATIONS
+    return {"images": images, "mask": mask, "depths": depths, "reference": reference, "shown": shown}
 
 
 def wear(body, material) -> None:
@@ -292,25 +292,9 @@ def wear(body, material) -> None:
 
 def work(folder: Path, kind: str, first_seed: int, temporary: Path) -> None:
     """Render a group into `temporary` and move it to its place when it is complete."""
-    for attempt in range(200):
-        group = make_group(first_seed + attempt, kind, temporary)
-        if group is not None:
-            break
-    else:
-        raise RuntimeError(f"{folder.name}: no plan in 200 attempts")
+    group, seed = first_group(lambda seed: make_group(seed, kind, temporary), first_seed, folder.name)
     (temporary / "shot.exr").unlink()
-    for name in ("images", "masks", "depths"):
-        (temporary / name).mkdir()
-    mask = Image.fromarray(group["mask"].astype(np.uint8) * 255)
-    depth = Image.fromarray(np.round(group["depth"] * 1000).astype(np.uint16))
-    for index, image in enumerate(group["images"]):
-        Image.fromarray(image).save(temporary / "images" / f"{index:02d}.jpg", **JPEG)
-        mask.save(temporary / "masks" / f"{index:02d}.png", optimize=True)
-        depth.save(temporary / "depths" / f"{index:02d}.png", optimize=True)
-    Image.fromarray(group["reference"]).save(temporary / "reference.jpg", **JPEG)
-    facts = {"surface": SURFACES[kind], "kind": kind, "seed": first_seed + attempt, "surface_seen": group["shown"]}
-    (temporary / "group.json").write_text(json.dumps(facts) + "\n")
-    os.replace(temporary, folder)
+    write_group(group, kind, seed, temporary, folder)
 
 
 def main():
@@ -318,11 +302,11 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("renders"))
     parser.add_argument("--set", default="blender", help="name of the set below --out")
     parser.add_argument(
-        "--first_seed", type=int, default=40_000_000, help="scenes take seeds from here on, 200 a group"
+        "--first_seed", type=int, default=40_000_000, help=f"scenes take seeds from here on, {ATTEMPTS} a group"
     )
     parser.add_argument("--count", type=int, default=48, help="groups, the kinds in turn")
     args = parser.parse_args()
-    root, kinds = args.out / args.set, list(SURFACES)
+    root, kinds = args.out / args.set, list(KINDS)
     root.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=args.out, prefix=f"{args.set}.part.") as parts:
         for index in tqdm(range(args.count), unit="group"):
@@ -330,7 +314,7 @@ def main():
             folder, temporary = root / f"{kind}_{index:04d}", Path(parts) / f"{index:04d}"
             if not folder.exists():
                 temporary.mkdir()
-                work(folder, kind, args.first_seed + index * 200, temporary)
+                work(folder, kind, args.first_seed + index * ATTEMPTS, temporary)
 
 
 if __name__ == "__main__":

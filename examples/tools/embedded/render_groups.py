@@ -17,7 +17,6 @@ are skipped.
 """
 
 import argparse
-import json
 import os
 import shutil
 from concurrent.futures import ProcessPoolExecutor
@@ -29,16 +28,13 @@ import rooms
 import shapes
 import targets
 import textures
-from PIL import Image
+from group_files import ATTEMPTS, KEPT, KINDS, first_group, write_group
 from tqdm import tqdm
 
-KINDS = {"mirror": "mirror", "pane": "transparent", "solid": "transparent"}
 SPLITS = {"train": {"mirror": 106, "pane": 106, "solid": 106}, "validation": {"mirror": 8, "pane": 8, "solid": 8}}
 DUST = 0.12, 0.3  # share of light that the film on a mirror or glass scatters
 REAR = 2.0, 4.0  # metres of the room behind the camera, for a mirror to show
 OPENINGS = 0.3  # doors are mostly closed when a group is taken: this share of the usual doorways and windows
-KEPT = 140, 112  # pixels across and down, the input of the base: many groups teach more than large pictures of few
-JPEG = {"quality": 95, "optimize": True, "progressive": True}
 FIRST_SEED = {"train": 0, "validation": 4_000_000}
 
 
@@ -311,26 +307,10 @@ def make_group(seed: int, kind: str, single: bool = False):
 
 def work(task) -> str:
     folder, kind, first_seed, single = task
-    for attempt in range(200):
-        group = make_group(first_seed + attempt, kind, single)
-        if group is not None:
-            break
-    else:
-        raise RuntimeError(f"{folder.name}: no plan in 200 attempts")
+    group, seed = first_group(lambda seed: make_group(seed, kind, single), first_seed, folder.name)
     temporary = folder.with_name(folder.name + ".part")
     shutil.rmtree(temporary, ignore_errors=True)
-    for name in ("images", "masks", "depths"):
-        (temporary / name).mkdir(parents=True)
-    for index, (image, depth) in enumerate(zip(group["images"], group["depths"], strict=True)):
-        Image.fromarray(image).save(temporary / "images" / f"{index:02d}.jpg", **JPEG)
-        Image.fromarray(group["mask"].astype(np.uint8) * 255).save(
-            temporary / "masks" / f"{index:02d}.png", optimize=True
-        )
-        Image.fromarray(depth).save(temporary / "depths" / f"{index:02d}.png", optimize=True)
-    Image.fromarray(group["reference"]).save(temporary / "reference.jpg", **JPEG)
-    facts = {"surface": KINDS[kind], "kind": kind, "seed": first_seed + attempt, "surface_seen": group["shown"]}
-    (temporary / "group.json").write_text(json.dumps(facts) + "\n")
-    os.replace(temporary, folder)
+    write_group(group, kind, seed, temporary, folder)
     return folder.name
 
 
@@ -340,7 +320,7 @@ def shipped(out: Path) -> list[tuple]:
     for split, kinds in SPLITS.items():
         for number, (kind, count) in enumerate(kinds.items()):
             for index in range(count):
-                seed = FIRST_SEED[split] + (number * 1000 + index) * 200
+                seed = FIRST_SEED[split] + (number * 1000 + index) * ATTEMPTS
                 tasks.append((out / split / f"{kind}_{index:03d}", kind, seed, False))
     return sorted(
         tasks, key=lambda task: (task[0].parent.name, task[0].name.rsplit("_")[1])
@@ -351,7 +331,7 @@ def more(out: Path, first_seed: int, count: int, single: bool) -> list[tuple]:
     """The tasks of a set of its own: the kinds in turn, so that any first part of it is balanced."""
     kinds = list(KINDS)
     return [
-        (out / f"{kinds[index % 3]}_{index:04d}", kinds[index % 3], first_seed + index * 200, single)
+        (out / f"{kinds[index % 3]}_{index:04d}", kinds[index % 3], first_seed + index * ATTEMPTS, single)
         for index in range(count)
     ]
 
@@ -361,7 +341,9 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("renders/groups"))
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--set", help="name of a set of its own below --out")
-    parser.add_argument("--first_seed", type=int, help="of --set: its scenes take seeds from here on, 200 a group")
+    parser.add_argument(
+        "--first_seed", type=int, help=f"of --set: its scenes take seeds from here on, {ATTEMPTS} a group"
+    )
     parser.add_argument("--count", type=int, default=24, help="of --set: groups")
     parser.add_argument("--photos", action="store_true", help="of --set: one see-through or mirroring photo a scene")
     args = parser.parse_args()
